@@ -1,0 +1,226 @@
+r"""Trajectories of stochastic LTI systems as Pyro distributions.
+
+`LTIProcess` is the noise-free trajectory: a Gaussian process over time with the mean response to
+the inputs and the stationary covariance of the process noise. `ObservedLTIProcess` adds white
+measurement noise and integrates the trajectory out exactly.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import torch
+from pyro.distributions import constraints
+from torch import Tensor
+
+from pyro_dynogp._errors import invalid
+from pyro_dynogp._tensors import as_tensor
+from pyro_dynogp.distributions.trajectory import Trajectory, real_or_missing
+from pyro_dynogp.lti.grid import time_grid
+from pyro_dynogp.lti.modes import Modes
+from pyro_dynogp.lti.response import Response, as_inputs, mean_response
+from pyro_dynogp.lti.semiseparable import SemiseparableCovariance, jitter_variance
+from pyro_dynogp.lti.state import ModalState
+
+if TYPE_CHECKING:
+    from pyro_dynogp.distributions.conditioned import ConditionedLTIProcess
+
+
+class LTIProcess(Trajectory):
+    """Trajectory of a stochastic LTI system: a sample site of Pyro, joint in time.
+
+    Args:
+        modes: the system; batch dimensions of the modes are batch dimensions of the distribution.
+        time: t (n,) [s], increasing, or a `TimeGrid`.
+        inputs: u (*b, n, n_u) [input], held constant between samples; None for no input.
+        initial_state: modal state at t[0]. None: mean zero and the stationary covariance. A
+            tensor x (*b, P), complex: that mean and the stationary covariance. A `ModalState`:
+            that Gaussian, integrated out exactly.
+        jitter: variance added to each sample of the noise-free trajectory, as a share of the
+            stationary variance: finely sampled smooth trajectories are singular in float64
+            without it. It plays no part in `observed`.
+        offset: constant added to the mean [output], of batch shape (*b), or (*b, n_y).
+
+    Batch shape: that of modes, inputs, initial state and offset, broadcast. Event shape: (n,) for one
+    output, (n, n_y) for modes with an output dimension. dtype float64.
+
+    Raises:
+        ValueError: on shapes that do not fit, times that decrease, NaN in the inputs.
+    """
+
+    def __init__(
+        self,
+        modes: Modes,
+        time: Any,
+        inputs: Any = None,
+        initial_state: Any = None,
+        *,
+        jitter: float = 1e-9,
+        offset: Any = None,
+        validate_args: bool | None = None,
+    ) -> None:
+        self.modes = modes
+        self.grid = time_grid(time)
+        self.inputs = as_inputs(modes, self.grid, inputs)
+        if initial_state is not None and not isinstance(initial_state, ModalState):
+            x0 = as_tensor(initial_state, torch.complex128, modes.poles.device)
+            initial_state = ModalState(x0)
+        self.initial_state: ModalState | None = initial_state
+        self.jitter = jitter
+        shapes = [modes.batch_shape, self.inputs.shape[:-2]]
+        if initial_state is not None:
+            shapes.append(initial_state.mean.shape[:-1])
+            if initial_state.covariance is not None:
+                shapes.append(initial_state.covariance.shape[:-2])
+        self.offset: Tensor | None = None
+        if offset is not None:
+            b = as_tensor(offset, device=modes.poles.device)
+            if modes.several_outputs and b.shape[-1:] != (modes.outputs,):
+                raise invalid(
+                    "offset", expected=f"shape (..., {modes.outputs})", got=f"{tuple(b.shape)}"
+                )
+            self.offset = b.unsqueeze(-2) if modes.several_outputs else b.unsqueeze(-1)
+            shapes.append(b.shape[: b.dim() - modes.several_outputs])
+        self._response: Response | None = None
+        self._shape(torch.broadcast_shapes(*shapes), len(self.grid), validate_args)
+
+    @property
+    def support(self) -> constraints.Constraint:
+        """Real trajectories."""
+        return constraints.independent(constraints.real, len(self.event_shape))
+
+    @property
+    def initial_covariance(self) -> Tensor | None:
+        """Covariance of the state at the first time, None for the stationary one."""
+        return None if self.initial_state is None else self.initial_state.covariance
+
+    @property
+    def response(self) -> Response:
+        """Mean response to the inputs, without offset, and the state it ends in."""
+        if self._response is None:
+            x0 = None if self.initial_state is None else self.initial_state.mean
+            self._response = mean_response(self.modes, self.grid, self.inputs, x0)
+        return self._response
+
+    @property
+    def mean(self) -> Tensor:
+        """(*batch, *event)."""
+        m = self.response.output
+        if self.offset is not None:
+            m = m + self.offset
+        return m.expand(self.batch_shape + self.event_shape)
+
+    @property
+    def variance(self) -> Tensor:
+        """(*batch, *event): of each sample by itself, without jitter."""
+        unseen = torch.full((self._size,), math.inf, dtype=torch.float64)
+        p = self.covariance(unseen.to(self.modes.poles.device)).signal_variance_given_past
+        return self.to_event(p).expand(self.batch_shape + self.event_shape)
+
+    def covariance(self, noise_variance: Tensor) -> SemiseparableCovariance:
+        """Covariance of the trajectory plus independent noise of the given variance (*b, N)."""
+        return SemiseparableCovariance(
+            self.modes, self.grid, noise_variance, self.initial_covariance
+        )
+
+    @property
+    def noise_rows(self) -> Tensor:
+        """The jitter, as a variance (*b, N) [output^2]."""
+        v = jitter_variance(self.modes, self.initial_covariance, self.jitter)
+        return v.expand((*v.shape[:-1], self._size))
+
+    def observed(self, noise_sd: Any, *, varying: bool = False) -> ObservedLTIProcess:
+        """Trajectory plus white measurement noise, the trajectory integrated out.
+
+        Args:
+            noise_sd: standard deviation [output] of batch shape (*b), or (*b, n_y) for several
+                outputs; with `varying`, of the shape of a whole trajectory (*b, *event).
+            varying: whether noise_sd changes from sample to sample.
+        """
+        return ObservedLTIProcess(self, noise_sd, varying=varying)
+
+    def condition(self, y: Any, noise_sd: Any, *, varying: bool = False) -> ConditionedLTIProcess:
+        """Trajectory given noisy samples y (..., *event); NaN where there is none.
+
+        See `ConditionedLTIProcess`; noise_sd and varying as in `observed`.
+        """
+        from pyro_dynogp.distributions.conditioned import ConditionedLTIProcess
+
+        return ConditionedLTIProcess(self.observed(noise_sd, varying=varying), y)
+
+
+class ObservedLTIProcess(Trajectory):
+    """Noisy samples y = h + e of a trajectory h, with h integrated out.
+
+    NaN in a value marks a missing sample and integrates out. Log-density, gradient and samples
+    are exact and O(n). Make it by `LTIProcess.observed`.
+
+    Raises:
+        ValueError: where noise_sd is negative, not finite or of a wrong shape, or zero although
+            two samples share a time.
+    """
+
+    def __init__(
+        self,
+        process: LTIProcess,
+        noise_sd: Any,
+        *,
+        varying: bool = False,
+        validate_args: bool | None = None,
+    ) -> None:
+        self.modes = process.modes
+        self.process = process
+        sd = as_tensor(noise_sd, device=self.modes.poles.device)
+        if not bool((sd >= 0).all() and torch.isfinite(sd).all()):
+            raise invalid("noise_sd", expected="finite numbers >= 0", got=f"{sd.detach().min()}")
+        repeated = bool((process.grid.step_index[1:] == -1).any())
+        if repeated and bool((sd == 0).any()):
+            raise invalid(
+                "noise_sd",
+                expected="numbers > 0, since two samples share a time",
+                got="zero",
+                advice="Without measurement noise two samples of one time cannot differ: "
+                "give noise_sd > 0 or drop the repeated time.",
+            )
+        n, several = len(process.grid), self.modes.several_outputs
+        if several and not varying and sd.dim() == 0:
+            sd = sd.expand(self.modes.outputs)
+        constant = (self.modes.outputs,) if several else ()
+        tail = tuple(process.event_shape) if varying else constant
+        if sd.shape[sd.dim() - len(tail) :] != torch.Size(tail):
+            raise invalid(
+                "noise_sd", expected=f"shape (..., {tail})", got=f"shape {tuple(sd.shape)}"
+            )
+        batch = sd.shape[: sd.dim() - len(tail)]
+        v = sd.square()
+        if not varying:
+            v = v.unsqueeze(-2) if several else v.unsqueeze(-1)
+            v = v.expand((*batch, n, *constant))
+        self.noise_variance = v
+        self._shape(torch.broadcast_shapes(process.batch_shape, batch), n, validate_args)
+
+    @property
+    def support(self) -> constraints.Constraint:
+        """Real trajectories in which NaN marks a missing sample."""
+        return constraints.independent(real_or_missing, len(self.event_shape))
+
+    @property
+    def mean(self) -> Tensor:
+        """(*batch, *event)."""
+        return self.process.mean.expand(self.batch_shape + self.event_shape)
+
+    @property
+    def variance(self) -> Tensor:
+        """(*batch, *event)."""
+        shape = self.batch_shape + self.event_shape
+        return self.process.variance.expand(shape) + self.noise_variance
+
+    def covariance(self, noise_variance: Tensor) -> SemiseparableCovariance:
+        """Covariance of the trajectory plus independent noise of the given variance (*b, N)."""
+        return self.process.covariance(noise_variance)
+
+    @property
+    def noise_rows(self) -> Tensor:
+        """Measurement-noise variance (*b, N) [output^2]."""
+        return self.rows(self.noise_variance)

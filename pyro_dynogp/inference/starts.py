@@ -1,0 +1,132 @@
+"""Starting points: poles at random, everything else by linear least squares given the poles."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pyro_dynogp.lti.grid import time_grid
+from pyro_dynogp.lti.modes import Modes
+from pyro_dynogp.lti.response import held_states
+from pyro_dynogp.models.linear import LinearDynamicGP
+from pyro_dynogp.models.priors import HORSESHOE_SCALE, TimeScale
+from pyro_dynogp.record import Record
+from pyro_dynogp.scaling import Scaling
+
+
+def starting_values(
+    model: LinearDynamicGP, records: Sequence[Record], *, count: int, seed: int, tries: int = 48
+) -> list[dict[str, Tensor]]:
+    """Values of every site for the `count` best of `tries` random sets of poles.
+
+    Given the poles, the simulated output is linear in the residues c_j B_j, the feedthrough and
+    the offset: ridge regression gives them, and its residual ranks the sets.
+
+    Args:
+        model: with its scaling. records: the training records.
+        count: how many starts to return, best first. seed: of the random poles.
+        tries: sets of poles to look at; fewer for very long records.
+    """
+    scaling = model.scaling or Scaling.from_records(records)
+    generator = np.random.default_rng(seed)
+    total = sum(len(record) for record in records)
+    tries = max(count, min(tries, int(2e6 / total)))
+    candidates = []
+    for _ in range(tries):
+        poles = random_poles(model.pairs, scaling, generator)
+        candidates.append(_given_poles(model, records, scaling, poles))
+    candidates.sort(key=lambda candidate: candidate[0])
+    return [values for _, values in candidates[:count]]
+
+
+def random_poles(pairs: int, scaling: Scaling, generator: np.random.Generator) -> np.ndarray:
+    """Poles (P,) with log-uniform natural frequency and uniform damping ratio, slowest first."""
+    low, high = TimeScale(float(scaling.time_step), float(scaling.duration)).rate_bounds
+    # Not right at the limits: nothing can be learnt there and gradients vanish.
+    rate = np.exp(np.sort(generator.uniform(low + 1.0, high - 0.7, pairs)))
+    damping = generator.uniform(0.1, 0.95, pairs)
+    return rate * (-damping + 1j * np.sqrt(1.0 - damping**2))
+
+
+def _given_poles(
+    model: LinearDynamicGP, records: Sequence[Record], scaling: Scaling, poles: np.ndarray
+) -> tuple[float, dict[str, Tensor]]:
+    P, n_u, n_y = model.pairs, model.inputs, model.outputs
+    designs, targets = [], []
+    for record in records:
+        u = (record.inputs - scaling.input_offset) / scaling.input_scale
+        designs.append(_design(poles, record.time, u, model.feedthrough))
+        targets.append((record.outputs - scaling.output_offset) / scaling.output_scale)
+    X, Y = np.concatenate(designs), np.concatenate(targets)
+    weights = np.stack([_ridge(X, Y[:, a]) for a in range(n_y)])  # n_y, columns
+    residual = Y - X @ weights.T
+    spread = np.nanstd(residual, axis=0)
+    rate = np.abs(poles)
+    gains = weights[:, : 2 * P * n_u].reshape(n_y, P, n_u, 2)
+    residues = (gains[..., 0] + 1j * gains[..., 1]) * rate[:, None]  # c_aj B_jm
+    values: dict[str, Any] = {
+        "g.log_decay": np.log(-poles.real),
+        "g.log_frequency": np.log(poles.imag),
+        "offset": weights[:, -1],
+        "noise_sd": 0.7 * spread + 1e-3,
+    }
+    direction = np.ones((n_y, P), dtype=complex)
+    B = residues[0]
+    if model.several_outputs:
+        # The best single direction for each pair: first singular vectors of its residues.
+        B = np.zeros((P, n_u), dtype=complex)
+        for j in range(P):
+            if n_u:
+                left, size, right = np.linalg.svd(residues[:, j, :], full_matrices=False)
+                turn = np.exp(-1j * np.angle(left[0, 0]))
+                direction[:, j], B[j] = left[:, 0] * turn, size[0] * right[0] / turn
+        values["g.output_gain"] = np.stack([direction.real, direction.imag], -1)
+    if n_u:
+        scaled = B / rate[:, None]
+        values["g.input_gain"] = np.stack([scaled.real, scaled.imag], -1)
+        if model.feedthrough:
+            D = weights[:, 2 * P * n_u : -1]
+            values["g.feedthrough"] = D if model.several_outputs else D[0]
+    if model.process_noise:
+        brownian = model.brownian or n_y
+        share = 0.3 * float(spread.mean()) / math.sqrt(P * brownian)
+        values["g.noise_gain.local_scale"] = np.full(P, math.sqrt(share / HORSESHOE_SCALE))
+        unit = np.zeros((P, brownian, 2))
+        unit[..., 0] = math.sqrt(share / HORSESHOE_SCALE)
+        values["g.noise_gain.unit"] = unit
+    if model.initial_state == "site":
+        suffixes = [""] if len(records) == 1 else [f".{i}" for i in range(len(records))]
+        for suffix in suffixes:
+            values[f"initial_state{suffix}"] = np.zeros((P, 2))
+    tensors = {name: torch.tensor(value, dtype=torch.float64) for name, value in values.items()}
+    return float(np.nanmean(residual**2)), tensors
+
+
+def _design(poles: np.ndarray, time: np.ndarray, u: np.ndarray, feedthrough: bool) -> np.ndarray:
+    """Regressors (n, 2 P n_u + n_u + 1): y = 2 Re sum B/|lambda| x + D u + offset."""
+    n, n_u = u.shape
+    grid = time_grid(time)
+    columns = []
+    if n_u:
+        modes = Modes(poles, np.ones((len(poles), 1)), np.ones(len(poles)))
+        states = np.stack(
+            [held_states(modes, grid, u[:, m : m + 1]) for m in range(n_u)], -1
+        )  # n, P, n_u
+        states = 2.0 * states * np.abs(poles)[:, None]
+        columns.append(np.stack([states.real, -states.imag], -1).reshape(n, -1))
+        if feedthrough:
+            columns.append(u)
+    columns.append(np.ones((n, 1)))
+    return np.concatenate(columns, axis=1)
+
+
+def _ridge(X: np.ndarray, y: np.ndarray, strength: float = 1e-4) -> np.ndarray:
+    there = np.isfinite(y)
+    A = X[there].T @ X[there]
+    scale = np.trace(A) / len(A)
+    return np.linalg.solve(A + strength * scale * np.eye(len(A)), X[there].T @ y[there])

@@ -1,0 +1,119 @@
+r"""Stationary covariance of a stochastic LTI system in modal form.
+
+The Lyapunov equation of a diagonal system has the solution (paper, Lemma 1)
+
+    E[xi_a xi_b^H] = -L_a L_b^H / (lambda_a + conj lambda_b),
+    E[xi_a xi_b^T] = -L_a L_b^T / (lambda_a + lambda_b),
+
+for all pairs a, b with shared noise, and for a = b alone with independent noise. The covariance of
+the outputs at lag tau >= 0 is then a sum of damped sinusoids,
+
+    S_ab(tau) = E[y_a(t + tau) y_b(t)] = 2 Re sum_j c_aj q_bj exp(lambda_j tau),
+    q_bj = E[xi_j y_b] = sum_i E[xi_j xi_i^H] conj(c_bi) + E[xi_j xi_i^T] c_bi,
+
+and S_ab(-tau) = S_ba(tau). (Proposition 1 of the paper prints other exponents for t' < t, with
+which the kernel would not be symmetric.)
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pyro_dynogp._tensors import as_tensor
+from pyro_dynogp.lti.modes import Modes
+
+
+def modal_covariance(modes: Modes) -> tuple[Tensor, Tensor]:
+    """Stationary E[xi xi^H] and E[xi xi^T], each (*b, P, P), complex."""
+    lam, L = modes.poles, modes.L
+    hermitian = -(L @ L.mH) / (lam.unsqueeze(-1) + lam.conj().unsqueeze(-2))
+    symmetric = -(L @ L.mT) / (lam.unsqueeze(-1) + lam.unsqueeze(-2))
+    if modes.noise == "independent":
+        same = torch.eye(modes.pairs, dtype=torch.bool, device=lam.device)
+        zero = torch.zeros((), dtype=hermitian.dtype, device=lam.device)
+        hermitian = torch.where(same, hermitian, zero)
+        symmetric = torch.where(same, symmetric, zero)
+    return hermitian, symmetric
+
+
+def real_covariance(hermitian: Tensor, symmetric: Tensor) -> Tensor:
+    """Covariance (*b, 2P, 2P) of [Re xi; Im xi] from E[xi xi^H] and E[xi xi^T]."""
+    plus, minus = 0.5 * (symmetric + hermitian), 0.5 * (symmetric - hermitian)
+    return torch.cat(
+        [
+            torch.cat([plus.real, minus.imag], dim=-1),
+            torch.cat([plus.imag, -minus.real], dim=-1),
+        ],
+        dim=-2,
+    )
+
+
+def state_covariance(modes: Modes) -> Tensor:
+    """Stationary covariance (*b, 2P, 2P) of the real state [Re x; Im x] that noise drives."""
+    return real_covariance(*modal_covariance(modes))
+
+
+def state_output_covariance(modes: Modes) -> Tensor:
+    """q (*b, n_y, P), complex: the covariance of each mode with each output."""
+    hermitian, symmetric = modal_covariance(modes)
+    C = modes.C
+    return (hermitian @ C.mH + symmetric @ C.mT).mT
+
+
+def output_row(modes: Modes) -> Tensor:
+    """The real row h (*b, n_y, 2P) with y = h [Re x; Im x]."""
+    return torch.cat([2.0 * modes.C.real, -2.0 * modes.C.imag], dim=-1)
+
+
+def stationary_variance(modes: Modes) -> Tensor:
+    """Variance S_aa(0) of each output (*b, n_y), without measurement noise."""
+    return 2.0 * (modes.C * state_output_covariance(modes)).sum(-1).real
+
+
+def autocovariance(modes: Modes, lag: Tensor) -> Tensor:
+    """Covariance of the outputs as a function of lag.
+
+    Args:
+        modes: the system.
+        lag: tau [s], any shape, any sign.
+
+    Returns:
+        S (*b, *lag.shape, n_y, n_y) [output^2] with S[..., a, b] = E[y_a(t + tau) y_b(t)];
+        without the last two dimensions for a system with one output.
+    """
+    lag = as_tensor(lag, device=modes.poles.device)
+    flat = lag.reshape(-1)
+    weights = modes.C.unsqueeze(-2) * state_output_covariance(modes).unsqueeze(-3)  # a, b, P
+    decay = torch.exp(modes.poles.unsqueeze(-2) * flat.abs().unsqueeze(-1))  # *b, m, P
+    S = 2.0 * torch.einsum("...abp,...mp->...mab", weights, decay).real
+    S = torch.where((flat < 0)[:, None, None], S.mT, S)
+    S = S.reshape(S.shape[:-3] + lag.shape + S.shape[-2:])
+    return S if modes.several_outputs else S[..., 0, 0]
+
+
+def power_spectrum(modes: Modes, omega: Tensor) -> Tensor:
+    """Two-sided spectral density of the outputs that process noise causes.
+
+    Args:
+        modes: the system.
+        omega: angular frequencies (m,) [rad/s].
+
+    Returns:
+        (*b, m, n_y, n_y) [output^2 s], complex Hermitian, the Fourier transform of S(tau); without
+        the last two dimensions (and real) for a system with one output.
+    """
+    s = 1j * as_tensor(omega, device=modes.poles.device)
+    lam, C, L = modes.poles, modes.C, modes.L
+    direct = C.unsqueeze(-3) / (s[:, None] - lam.unsqueeze(-2)).unsqueeze(-2)  # *b, m, n_y, P
+    mirrored = C.conj().unsqueeze(-3) / (s[:, None] - lam.conj().unsqueeze(-2)).unsqueeze(-2)
+    Lm = L.unsqueeze(-3)
+    if modes.noise == "shared":
+        G = direct @ Lm + mirrored @ Lm.conj()
+    else:  # a Brownian motion of its own for each pair: pairs side by side
+        G = direct.unsqueeze(-1) * Lm.unsqueeze(-3) + mirrored.unsqueeze(-1) * Lm.conj().unsqueeze(
+            -3
+        )
+        G = G.flatten(-2)
+    S = G @ G.mH
+    return S if modes.several_outputs else S[..., 0, 0].real

@@ -1,0 +1,280 @@
+r"""O(n) algebra with the covariance of a stochastic LTI system and white measurement noise.
+
+    K = S(T, T) + diag(v),        K = L D L',  L unit lower triangular, D diagonal.
+
+S is semiseparable of rank 2P, so that the factorisation costs O(n P^2) and everything after it
+O(n P). Rows are ordered by time, the outputs of one time together: row k n_y + a is output a at
+time k. An infinite entry of v marks a missing sample, which is left out exactly.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pyro_dynogp._errors import invalid
+from pyro_dynogp._tensors import as_tensor
+from pyro_dynogp.lti import primitives
+from pyro_dynogp.lti.covariance import (
+    output_row,
+    state_covariance,
+    state_output_covariance,
+    stationary_variance,
+)
+from pyro_dynogp.lti.grid import time_grid
+from pyro_dynogp.lti.modes import Modes
+
+
+class NotPositiveDefiniteError(ValueError):
+    """A covariance that has to be inverted is singular in floating-point arithmetic."""
+
+
+class SemiseparableCovariance:
+    """The covariance of observed outputs, factored in O(n P^2).
+
+    Args:
+        modes: the system, batch shape *b.
+        time: (n,) times [s] or a `TimeGrid`.
+        noise_variance: v [output^2], scalar or (*b, N) with N = n n_y; infinite where missing.
+        initial_covariance: (*b, 2P, 2P) covariance of [Re x; Im x] at time[0]; None for the
+            stationary one.
+
+    Right-hand sides are (*b, N, R). Every result is differentiable with respect to poles, gains,
+    noise variance, initial covariance and right-hand sides.
+    """
+
+    def __init__(
+        self,
+        modes: Modes,
+        time: Any,
+        noise_variance: Tensor | float = 0.0,
+        initial_covariance: Tensor | None = None,
+    ) -> None:
+        self.modes = modes
+        self.grid = time_grid(time)
+        self.size = len(self.grid) * modes.outputs
+        v = as_tensor(noise_variance, device=modes.poles.device)
+        if v.dim() == 0:
+            v = v.expand(self.size)
+        if v.shape[-1] != self.size:
+            raise invalid(
+                "noise_variance",
+                expected=f"a scalar or shape (..., {self.size})",
+                got=f"shape {tuple(v.shape)}",
+            )
+        if not bool((v >= 0).all()):
+            raise invalid("noise_variance", expected="numbers >= 0", got=f"{float(v.min())}")
+        self.noise_variance = v
+        self.initial_covariance = initial_covariance
+
+    @cached_property
+    def _rows(self) -> primitives.Generators:
+        modes, grid = self.modes, self.grid
+        phi = torch.exp(modes.poles.unsqueeze(-2) * grid.steps.unsqueeze(-1))
+        q = state_output_covariance(modes)
+        step, out = grid.rows(modes.outputs)
+        if self.initial_covariance is None:
+            S0 = torch.zeros(
+                2 * modes.pairs, 2 * modes.pairs, dtype=torch.float64, device=phi.device
+            )
+        else:
+            S0 = state_covariance(modes) - self.initial_covariance
+        return primitives.Generators(
+            re=phi.real,
+            im=phi.imag,
+            h=output_row(modes),
+            g=torch.cat([q.real, q.imag], dim=-1),
+            k0=2.0 * (modes.C * q).sum(-1).real,
+            S0=S0,
+            step=step,
+            out=out,
+        )
+
+    @cached_property
+    def _factor(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        e, p, S_end = primitives.factor(self._rows, self.noise_variance)
+        d = p + self.noise_variance
+        if not bool((d > 0).all()):
+            bad = int((~(d > 0)).nonzero()[0][-1])
+            raise NotPositiveDefiniteError(
+                f"The covariance of the outputs is not positive definite at row {bad} "
+                f"(innovation variance {float(d.detach().reshape(-1, self.size)[0, bad])}). "
+                "Add measurement noise or jitter, or remove repeated times."
+            )
+        return e, p, d, e / d.unsqueeze(-1), S_end
+
+    @property
+    def missing(self) -> Tensor:
+        """Whether a row is missing (*b, N)."""
+        return torch.isinf(self.noise_variance)
+
+    @property
+    def innovation_variance(self) -> Tensor:
+        """D: variance of each sample given all before it (*b, N); infinite where missing."""
+        return self._factor[2]
+
+    @property
+    def signal_variance_given_past(self) -> Tensor:
+        """Variance of the noise-free output given the samples before (*b, N)."""
+        return self._factor[1]
+
+    @property
+    def final_covariance(self) -> Tensor:
+        """Covariance (*b, 2P, 2P) of the state at the last time, given all samples."""
+        return state_covariance(self.modes) - self._factor[4]
+
+    def log_determinant(self) -> Tensor:
+        """Log-determinant (*b,) of K without the missing rows."""
+        d = self.innovation_variance
+        return torch.where(torch.isinf(d), torch.ones_like(d), d).log().sum(-1)
+
+    def innovations(self, Y: Tensor) -> Tensor:
+        """L^{-1} Y (*b, N, R): each sample less its prediction from the samples before."""
+        return primitives.triangular(self._rows, self._factor[3], Y, solve=True)
+
+    def root_matmul(self, X: Tensor, *, transpose: bool = False) -> Tensor:
+        """L D^{1/2} X, or its transpose (*b, N, R). No row may be missing."""
+        self._refuse_missing("root_matmul")
+        root = self.innovation_variance.sqrt().unsqueeze(-1)
+        w = self._factor[3]
+        if transpose:
+            return root * (X + primitives.triangular(self._rows, w, X, transpose=True))
+        X = root * X
+        return X + primitives.triangular(self._rows, w, X)
+
+    def root_solve(self, Y: Tensor, *, transpose: bool = False) -> Tensor:
+        """D^{-1/2} L^{-1} Y, or its transpose (*b, N, R)."""
+        root = self.innovation_variance.rsqrt().unsqueeze(-1)
+        w = self._factor[3]
+        if transpose:
+            return primitives.triangular(self._rows, w, root * Y, solve=True, transpose=True)
+        return root * primitives.triangular(self._rows, w, Y, solve=True)
+
+    def solve(self, Y: Tensor) -> Tensor:
+        """K^{-1} Y (*b, N, R); zero in missing rows, whose entries of Y are not used."""
+        w = self._factor[3]
+        z = primitives.triangular(self._rows, w, Y, solve=True)
+        z = z / self.innovation_variance.unsqueeze(-1)
+        return primitives.triangular(self._rows, w, z, solve=True, transpose=True)
+
+    def signal_matmul(self, X: Tensor) -> Tensor:
+        """S X (*b, N, R), the covariance without measurement noise."""
+        rows = self._rows
+        g = rows.g[..., torch.as_tensor(rows.out, device=rows.g.device), :]
+        k0 = rows.k0[..., torch.as_tensor(rows.out, device=rows.g.device)]
+        Z = (
+            primitives.triangular(rows, g, X)
+            + primitives.triangular(rows, g, X, transpose=True)
+            + k0.unsqueeze(-1) * X
+        )
+        if self.initial_covariance is not None:
+            # What an initial covariance adds is of rank 2P: O (P0 - P_stationary) O'.
+            O = observability(self.modes, self.grid.time)
+            Z = Z - O @ (rows.S0 @ (O.mT @ X))
+        return Z
+
+    def matmul(self, X: Tensor) -> Tensor:
+        """K X (*b, N, R). No row may be missing."""
+        self._refuse_missing("matmul")
+        return self.signal_matmul(X) + self.noise_variance.unsqueeze(-1) * X
+
+    def cross_matmul(self, time: Any, X: Tensor) -> Tensor:
+        """S(T*, T) X (*b, N*, R) for other times T* (never decreasing)."""
+        other = time_grid(time).time
+        if self.initial_covariance is not None and bool(other[0] < self.grid.time[0]):
+            raise invalid(
+                "time",
+                expected=f"times from {float(self.grid.time[0])} on, where the state is given",
+                got=f"{float(other[0])}",
+            )
+        n_y = self.modes.outputs
+        merged = torch.cat([self.grid.time, other])
+        order = torch.argsort(merged, stable=True)
+        place = torch.argsort(order)
+        rows = (place.unsqueeze(-1) * n_y + torch.arange(n_y, device=place.device)).reshape(-1)
+        mine, theirs = rows[: self.size], rows[self.size :]
+        padded = torch.zeros(
+            *X.shape[:-2], merged.shape[0] * n_y, X.shape[-1], dtype=X.dtype, device=X.device
+        ).index_copy(-2, mine, X)
+        both = SemiseparableCovariance(
+            self.modes, merged[order], 0.0, initial_covariance=self.initial_covariance
+        )
+        return both.signal_matmul(padded)[..., theirs, :]
+
+
+    def inverse_diagonal(self) -> Tensor:
+        """Diagonal of K^{-1} (*b, N); zero in missing rows."""
+        d = self.innovation_variance
+        kappa = primitives.later_information(self._rows, self._factor[0], d)
+        return 1.0 / d + kappa / d.square()
+
+    def signal_variance(self) -> Tensor:
+        """Variance of the noise-free output at every row, missing ones too, given all (*b, N)."""
+        e, p, d, _, _ = self._factor
+        kappa = primitives.later_information(self._rows, e, d)
+        share = torch.where(self.missing, torch.ones_like(d), self.noise_variance / d)
+        share = torch.where(self.missing, torch.ones_like(d), share)
+        return (share * p - share.square() * kappa).clamp_min(0.0)
+
+    def log_prob(self, residual: Tensor) -> Tensor:
+        """Log-density (*b, R) of residuals (*b, N, R) under N(0, K), missing rows left out."""
+        z = self.innovations(residual)
+        d = self.innovation_variance.unsqueeze(-1)
+        count = (~self.missing).sum(-1, keepdim=True).to(d.dtype)
+        quadratic = (z.square() / d).sum(-2)
+        constant = count * math.log(2.0 * math.pi)
+        return -0.5 * (quadratic + self.log_determinant().unsqueeze(-1) + constant)
+
+    def final_state(self, residual: Tensor) -> Tensor:
+        """Mean (*b, P), complex, of the state at the last time given residuals (*b, N).
+
+        This is the departure from the mean response; add `mean_response(...).state`.
+        """
+        alpha = self.solve(residual.unsqueeze(-1)).squeeze(-1)
+        modes = self.modes
+        since = self.grid.time[-1] - self.grid.time  # age of each sample
+        decay = torch.exp(modes.poles.unsqueeze(-2) * since.unsqueeze(-1))  # *b, n, P
+        q = state_output_covariance(modes)
+        weights = alpha.reshape((*alpha.shape[:-1], len(self.grid), modes.outputs))
+        state = (decay * (weights.to(q.dtype) @ q)).sum(-2)
+        if self.initial_covariance is not None:
+            O = observability(modes, self.grid.time)
+            extra = -(self._rows.S0 @ (O.mT @ alpha.unsqueeze(-1))).squeeze(-1)
+            P = modes.pairs
+            carried = torch.complex(extra[..., :P], extra[..., P:])
+            age = self.grid.time[-1] - self.grid.time[0]
+            state = state + torch.exp(modes.poles * age) * carried
+        return state
+
+    def _refuse_missing(self, method: str) -> None:
+        if bool(self.missing.any()):
+            raise invalid(
+                "noise_variance",
+                expected=f"finite numbers for {method}",
+                got="infinite ones (missing samples)",
+                advice="Leave the missing times out of the time axis.",
+            )
+
+
+def observability(modes: Modes, time: Tensor) -> Tensor:
+    """Rows (*b, N, 2P) that read the outputs from the state [Re x; Im x] at time[0]."""
+    decay = torch.exp(modes.poles.unsqueeze(-2) * (time - time[0]).unsqueeze(-1))
+    row = modes.C.unsqueeze(-3) * decay.unsqueeze(-2)  # *b, n, n_y, P
+    real = torch.cat([2.0 * row.real, -2.0 * row.imag], dim=-1)
+    return real.flatten(-3, -2)
+
+
+def jitter_variance(modes: Modes, initial_covariance: Tensor | None, relative: float) -> Tensor:
+    """Variance (*b, 1) that is added to a noise-free trajectory so that it can be factored."""
+    variance = stationary_variance(modes).amax(-1)
+    if initial_covariance is not None:
+        h = output_row(modes)
+        variance = variance + torch.einsum(
+            "...ai,...ij,...aj->...a", h, initial_covariance, h
+        ).amax(-1)
+    tiny = torch.finfo(torch.float64).tiny ** 0.5
+    return (relative * variance + tiny).unsqueeze(-1)

@@ -1,0 +1,56 @@
+"""The modal state at one instant: what a record hands over to the next one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pyro_dynogp.lti.covariance import state_covariance
+from pyro_dynogp.lti.modes import Modes
+from pyro_dynogp.lti.response import complex_expm1
+
+
+@dataclass(frozen=True, eq=False)
+class ModalState:
+    """Gaussian distribution of the modal state x of a system at one time.
+
+    Attributes:
+        mean: (*b, P), complex.
+        covariance: (*b, 2P, 2P), real: covariance of [Re x; Im x], process noise included. None
+            stands for the stationary covariance of the system.
+    """
+
+    mean: Tensor
+    covariance: Tensor | None = None
+
+
+def real_propagator(phi: Tensor) -> Tensor:
+    """The real matrix (*b, 2P, 2P) that multiplies [Re x; Im x] where phi (*b, P) multiplies x."""
+    a, b = torch.diag_embed(phi.real), torch.diag_embed(phi.imag)
+    return torch.cat([torch.cat([a, -b], -1), torch.cat([b, a], -1)], -2)
+
+
+def propagate(
+    modes: Modes, state: ModalState, step: float, held_input: Tensor | None = None
+) -> ModalState:
+    """Carry a state over a gap.
+
+    Args:
+        modes: the system; its process noise acts during the gap.
+        state: distribution at the beginning.
+        step: length of the gap [s], not negative.
+        held_input: u (*b, n_u), constant over the gap; None for no input.
+    """
+    z = modes.poles * step
+    phi = torch.exp(z)
+    mean = phi * state.mean
+    if held_input is not None and modes.inputs:
+        drive = (modes.B @ held_input.to(modes.B.dtype).unsqueeze(-1)).squeeze(-1)
+        mean = mean + complex_expm1(z) / modes.poles * drive
+    stationary = state_covariance(modes)
+    if state.covariance is None:
+        return ModalState(mean, stationary)
+    F = real_propagator(phi)
+    return ModalState(mean, stationary + F @ (state.covariance - stationary) @ F.mT)

@@ -1,0 +1,227 @@
+"""The linear dynamic Gaussian process as a Pyro model: one stochastic LTI system, white noise."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import pyro
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+
+from pyro_dynogp._errors import invalid
+from pyro_dynogp._tensors import as_tensor
+from pyro_dynogp.distributions.process import LTIProcess
+from pyro_dynogp.lti.covariance import state_covariance
+from pyro_dynogp.lti.modes import Modes, NoiseStructure
+from pyro_dynogp.lti.state import ModalState
+from pyro_dynogp.models.priors import FLAT, PriorName, TimeScale, sample_modes
+from pyro_dynogp.record import Record, as_records
+from pyro_dynogp.scaling import Scaling
+
+InitialState = Literal["integrated", "zero", "site"]
+
+
+@dataclass(frozen=True)
+class LinearSystem:
+    """One draw (or a batch of draws) of all parameters, in the units of the record.
+
+    Attributes:
+        modes: poles and gains, batch shape *b.
+        offset: (*b,) or (*b, n_y): mean output at the mean inputs of the training record.
+        noise_sd: (*b,) or (*b, n_y): measurement noise [output].
+        initial_sd: (*b, P): prior standard deviation of Re and Im of the initial state.
+    """
+
+    modes: Modes
+    offset: Tensor
+    noise_sd: Tensor
+    initial_sd: Tensor
+
+
+@dataclass(frozen=True)
+class LinearDynamicGP:
+    """Output = stochastic LTI system driven by the inputs + offset + white measurement noise.
+
+    The trajectory is integrated out, so that the observed site ``y`` carries the exact marginal
+    likelihood. Calling the model with a record runs the Pyro model; with a sequence of records
+    they share every hyperparameter (sites ``y.0``, ``y.1``, ...). A record without outputs leaves
+    ``y`` unobserved, to be sampled.
+
+    Sites: those of `sample_modes` under the prefix ``g``, ``offset`` and ``noise_sd`` (n_y,) in
+    standard deviations of the training output (normal(0, 1) and log-normal around 0.1), and with
+    ``initial_state="site"`` ``initial_state`` (P, 2).
+
+    Args:
+        inputs: n_u, may be 0. outputs: n_y. pairs: P, the number of conjugate pairs (order 2P).
+        noise: "shared" (one set of Brownian motions drives all pairs) or "independent".
+        brownian: n_l, number of Brownian motions; by default n_y.
+        feedthrough: whether the input acts on the output at once.
+        process_noise: whether there is any.
+        initial_state: "integrated", a Gaussian as wide as the largest state that inputs of one
+            standard deviation can hold, integrated out; "zero"; or "site", sampled.
+        priors: "default", or "paper" for flat ones but for the horseshoe on the noise gains.
+        scaling: what one time step and one standard deviation are; learnt by `fit` from the
+            training record. Without it the record that the model is called with sets them.
+
+    Raises:
+        ValueError: on numbers below the least that makes sense, or unknown options.
+    """
+
+    inputs: int
+    outputs: int = 1
+    pairs: int = 5
+    noise: NoiseStructure = "shared"
+    brownian: int | None = None
+    feedthrough: bool = True
+    process_noise: bool = True
+    initial_state: InitialState = "integrated"
+    priors: PriorName = "default"
+    scaling: Scaling | None = None
+
+    def __post_init__(self) -> None:
+        for name, least in (("inputs", 0), ("outputs", 1), ("pairs", 1)):
+            value = getattr(self, name)
+            if not isinstance(value, int) or value < least:
+                raise invalid(name, expected=f"a whole number >= {least}", got=repr(value))
+        if self.initial_state not in ("integrated", "zero", "site"):
+            raise invalid(
+                "initial_state",
+                expected="'integrated', 'zero' or 'site'",
+                got=repr(self.initial_state),
+            )
+        if self.noise not in ("shared", "independent"):
+            raise invalid("noise", expected="'shared' or 'independent'", got=repr(self.noise))
+        if self.priors not in ("default", "paper"):
+            raise invalid("priors", expected="'default' or 'paper'", got=repr(self.priors))
+        if self.inputs == 0 and not self.process_noise:
+            raise invalid(
+                "process_noise", expected="True for a system without inputs", got="False"
+            )
+
+    def scaled_to(self, records: Record | Sequence[Record]) -> LinearDynamicGP:
+        """The same model with the scaling of the given training record(s)."""
+        return replace(self, scaling=Scaling.from_records(records))
+
+    def check(self, records: Record | Sequence[Record]) -> tuple[Record, ...]:
+        """Records whose channels and units fit the model.
+
+        Raises:
+            ValueError: where the number of channels or a unit differs.
+        """
+        checked = as_records(records)
+        for record in checked:
+            for what, expected, got in (
+                ("inputs", self.inputs, record.n_inputs),
+                ("outputs", self.outputs, record.n_outputs or self.outputs),
+            ):
+                if expected != got:
+                    raise invalid(
+                        "record",
+                        expected=f"{expected} {what}, as the model has",
+                        got=f"{got}",
+                        advice=f"Choose channels with record.select(...) or set {what}={got}.",
+                    )
+            if self.scaling is not None:
+                self.scaling.check(record)
+        return checked
+
+    @property
+    def several_outputs(self) -> bool:
+        """Whether trajectories have an output dimension."""
+        return self.outputs > 1
+
+    def sample_system(self, scaling: Scaling) -> LinearSystem:
+        """Sample all hyperparameters; the result is in the units of the record."""
+        n_y = self.outputs
+        several = self.several_outputs
+        modes = sample_modes(
+            "g",
+            inputs=self.inputs,
+            pairs=self.pairs,
+            outputs=n_y if several else None,
+            brownian=self.brownian or n_y,
+            noise=self.noise,
+            feedthrough=self.feedthrough,
+            process_noise=self.process_noise,
+            time_scale=TimeScale(float(scaling.time_step), float(scaling.duration)),
+            priors=self.priors,
+        )
+        flat = self.priors == "paper"
+        zero = torch.zeros(n_y, dtype=torch.float64)
+        offset = pyro.sample(
+            "offset", dist.Normal(zero, zero + (FLAT if flat else 1.0)).to_event(1)
+        )
+        noise_sd = pyro.sample(
+            "noise_sd",
+            dist.LogNormal(zero + math.log(0.1), zero + (FLAT if flat else 1.5)).to_event(1),
+        )
+        # |x_j| <= |B_j| max|u| / decay_j: no input of one standard deviation holds more.
+        reach = modes.B.abs().square().sum(-1).sqrt() / -modes.poles.real
+        y_scale = as_tensor(scaling.output_scale)
+        y_offset = as_tensor(scaling.output_offset)
+        shift, sd = y_offset + y_scale * offset, y_scale * noise_sd
+        return LinearSystem(
+            modes=modes.rescale(inputs=as_tensor(scaling.input_scale), outputs=y_scale)
+            if several
+            else modes.rescale(inputs=as_tensor(scaling.input_scale), outputs=y_scale[0]),
+            offset=shift if several else shift.squeeze(-1),
+            noise_sd=sd if several else sd.squeeze(-1),
+            initial_sd=reach,
+        )
+
+    def process(
+        self,
+        system: LinearSystem,
+        record: Record,
+        scaling: Scaling,
+        initial_state: ModalState | Tensor | None = None,
+        *,
+        process_noise: bool = True,
+    ) -> LTIProcess:
+        """Noise-free trajectory of the output along a record.
+
+        Args:
+            system: parameters. record: time and inputs. scaling: of the training record.
+            initial_state: state at the first time; by default the prior that the model states.
+            process_noise: False for the response of the deterministic system.
+        """
+        modes = system.modes if process_noise else system.modes.without_process_noise()
+        data = record.tensors()
+        inputs = data.inputs - as_tensor(scaling.input_offset) if self.inputs else None
+        if initial_state is None and self.initial_state == "integrated":
+            initial_state = self.prior_state(system, modes)
+        return LTIProcess(modes, data.time, inputs, initial_state, offset=system.offset)
+
+    @staticmethod
+    def prior_state(system: LinearSystem, modes: Modes) -> ModalState:
+        """Gaussian prior of the initial state: unknown past inputs plus past process noise."""
+        var = torch.cat([system.initial_sd, system.initial_sd], -1).square()
+        mean = torch.zeros_like(modes.poles)
+        return ModalState(mean, state_covariance(modes) + torch.diag_embed(var))
+
+    def __call__(self, records: Record | Sequence[Record]) -> None:
+        """Run the Pyro model on one record or on several."""
+        checked = self.check(records)
+        single = isinstance(records, Record)
+        scaling = self.scaling or Scaling.from_records(records)
+        system = self.sample_system(scaling)
+        for index, record in enumerate(checked):
+            suffix = "" if single else f".{index}"
+            state: Any = None
+            if self.initial_state == "site":
+                one = torch.ones(self.pairs, 2, dtype=torch.float64)
+                z = pyro.sample(f"initial_state{suffix}", dist.Normal(0.0 * one, one).to_event(2))
+                state = torch.complex(z[..., 0], z[..., 1]) * system.initial_sd
+            process = self.process(system, record, scaling, state)
+            outputs = record.tensors().outputs
+            if not self.several_outputs and record.n_outputs:
+                outputs = outputs[:, 0]
+            pyro.sample(
+                f"y{suffix}",
+                process.observed(system.noise_sd),
+                obs=outputs if record.n_outputs else None,
+            )

@@ -1,0 +1,175 @@
+r"""Priors on the poles and gains of a linear system, as Pyro sample sites.
+
+Everything is stated in units that the record sets: time in steps and lengths of the record, inputs
+and outputs in their standard deviations. The same record in hours or seconds, volts or millivolts
+gives the same posterior.
+
+Gauge: a single output has c_j = 1 (scale and phase of c_j, B_j and L_j are not separately
+identified); several outputs have c_j of unit length with a positive first entry.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import pyro
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+
+from pyro_dynogp._errors import invalid
+from pyro_dynogp.lti.modes import Modes, NoiseStructure
+
+PriorName = Literal["default", "paper"]
+
+# Scale of the horseshoe on the noise gains (paper, appendix "Implementation").
+HORSESHOE_SCALE = 0.1
+# Standard deviation of a prior that is flat for all practical purposes.
+FLAT = 1e3
+
+
+@dataclass(frozen=True)
+class TimeScale:
+    """What the record says about time constants.
+
+    Attributes:
+        step: median sampling step [s].
+        duration: length of the record [s].
+    """
+
+    step: float
+    duration: float
+
+    @property
+    def rate_bounds(self) -> tuple[float, float]:
+        """Logarithms of the slowest and fastest rates [1/s] that the record can show."""
+        return math.log(1.0 / self.duration), math.log(math.pi / self.step)
+
+    @property
+    def typical_rate(self) -> float:
+        """Geometric mean [1/s] of the slowest and fastest rates."""
+        return math.exp(0.5 * sum(self.rate_bounds))
+
+
+def _normal(scale: float, *shape: int) -> dist.Distribution:
+    zero = torch.zeros(shape, dtype=torch.float64)
+    return dist.Normal(zero, zero + scale).to_event(len(shape))
+
+
+def _complex(x: Tensor) -> Tensor:
+    return torch.complex(x[..., 0], x[..., 1])
+
+
+def sample_poles(name: str, pairs: int, time_scale: TimeScale, priors: PriorName) -> Tensor:
+    """Sample P poles (*b, P) [1/s].
+
+    Sites: ``<name>.log_decay`` and ``<name>.log_frequency`` (P,), logarithms of -Re lambda and of
+    Im lambda [1/s]. Default: uniform between the rates 1/duration and pi/step (for frequencies
+    from a tenth of the slowest rate, which is as good as a real pole). Paper: flat.
+    """
+    low, high = time_scale.rate_bounds
+    if high <= low:
+        raise invalid("time_scale", expected="more than three samples", got=repr(time_scale))
+    if priors == "paper":
+        centre = torch.full((pairs,), 0.5 * (low + high), dtype=torch.float64)
+        flat = dist.Normal(centre, torch.full_like(centre, FLAT)).to_event(1)
+        log_decay = pyro.sample(f"{name}.log_decay", flat)
+        log_frequency = pyro.sample(f"{name}.log_frequency", flat)
+    else:
+        top = torch.full((pairs,), high, dtype=torch.float64)
+
+        def uniform(bottom: float) -> dist.Distribution:
+            return dist.Uniform(torch.full_like(top, bottom), top).to_event(1)
+
+        log_decay = pyro.sample(f"{name}.log_decay", uniform(low))
+        log_frequency = pyro.sample(f"{name}.log_frequency", uniform(low - math.log(10.0)))
+    return torch.complex(-log_decay.exp(), log_frequency.exp())
+
+
+def sample_horseshoe(name: str, *shape: int, scale: float = HORSESHOE_SCALE) -> Tensor:
+    """Horseshoe of the given scale over rows: scale * local * z (*b, *shape).
+
+    Hierarchical and non-centred (Carvalho, Polson & Scott 2009): sites ``<name>.local_scale``
+    (shape[0],) half-Cauchy(1) and ``<name>.unit`` standard normal. Its density is proper, unlike
+    the horseshoe density itself, whose mode at zero is infinite.
+    """
+    one = torch.ones(shape[:1], dtype=torch.float64)
+    local = pyro.sample(f"{name}.local_scale", dist.HalfCauchy(one).to_event(1))
+    unit = pyro.sample(f"{name}.unit", _normal(1.0, *shape))
+    return scale * local.reshape(local.shape + (1,) * (len(shape) - 1)) * unit
+
+
+def sample_modes(
+    name: str,
+    *,
+    inputs: int,
+    pairs: int,
+    outputs: int | None = None,
+    brownian: int = 1,
+    noise: NoiseStructure = "shared",
+    feedthrough: bool = True,
+    process_noise: bool = True,
+    time_scale: TimeScale | None = None,
+    priors: PriorName = "default",
+) -> Modes:
+    """Sample a stochastic LTI system, for inputs and outputs of unit standard deviation.
+
+    Sites (all start with ``<name>.``), * marking what depends on the options:
+
+    - ``log_decay``, ``log_frequency`` (P,): see `sample_poles`.
+    - ``input_gain`` (P, n_u, 2)*: Re and Im of B/|lambda| (output per input), normal(0, 3).
+    - ``output_gain`` (n_y, P, 2)*: direction of c, only for several outputs; normal(0, 1).
+    - ``noise_gain.local_scale`` (P,), ``noise_gain.unit`` (P, n_l, 2)*: horseshoe of scale 0.1 on
+      L/sqrt(2 r), r the typical rate of the record: roughly the standard deviation of the output
+      of a pair that decays at that rate. Since the prior is on L itself (as the paper's), a pair
+      so fast that it would imitate measurement noise needs a large, unlikely L.
+    - ``feedthrough`` (n_y, n_u) or (n_u,)*: normal(0, 1).
+
+    Args:
+        name: prefix of the sites.
+        inputs: n_u. pairs: P.
+        outputs: n_y for modes with an output dimension; None for a single output without one.
+        brownian: n_l, number of Brownian motions (for each pair, if independent).
+        noise: "shared" or "independent", see `Modes`.
+        feedthrough: whether there is a direct path D.
+        process_noise: whether there is process noise at all.
+        time_scale: step and duration of the record [s]; by default time is counted in samples of
+            a record of 1000.
+        priors: "default", or "paper" for flat ones but for the horseshoe.
+
+    Returns:
+        Modes with the batch shape of the sites (particles).
+    """
+    if priors not in ("default", "paper"):
+        raise invalid("priors", expected="'default' or 'paper'", got=repr(priors))
+    scale = time_scale or TimeScale(1.0, 1000.0)
+    poles = sample_poles(name, pairs, scale, priors)
+    flat = priors == "paper"
+    B = L = D = None
+    if inputs:
+        gain = pyro.sample(f"{name}.input_gain", _normal(FLAT if flat else 3.0, pairs, inputs, 2))
+        B = _complex(gain) * poles.abs().unsqueeze(-1)
+        if feedthrough:
+            shape = (inputs,) if outputs is None else (outputs, inputs)
+            D = pyro.sample(f"{name}.feedthrough", _normal(FLAT if flat else 1.0, *shape))
+    if process_noise:
+        share = sample_horseshoe(f"{name}.noise_gain", pairs, brownian, 2)
+        L = _complex(share) * math.sqrt(2.0 * scale.typical_rate)
+    if outputs is None:
+        c = torch.ones(pairs, dtype=torch.complex128)
+        c = c.expand(poles.shape)
+    else:
+        raw = _complex(pyro.sample(f"{name}.output_gain", _normal(1.0, outputs, pairs, 2)))
+        c = unit_direction(raw)
+    return Modes(
+        poles=poles, input_gain=B, output_gain=c, noise_gain=L, feedthrough=D, noise=noise
+    )
+
+
+def unit_direction(raw: Tensor) -> Tensor:
+    """Columns of raw (*b, n_y, P) scaled to unit length, their first entries real, positive."""
+    first = raw[..., :1, :]
+    turned = raw * (first.conj() / first.abs())
+    return turned / raw.abs().square().sum(-2, keepdim=True).sqrt()

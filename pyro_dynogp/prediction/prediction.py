@@ -1,0 +1,128 @@
+"""What a prediction is: a Gaussian mixture at every time, with joint samples and a decomposition."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.special import logsumexp, ndtr, ndtri
+
+from pyro_dynogp._errors import invalid
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Predictive distribution of measured outputs, in the units of the record.
+
+    Given the parameters the outputs are Gaussian; over S posterior draws they are an equal-weight
+    mixture, whose moments, quantiles and densities here are exact.
+
+    Attributes:
+        time: (n,) [s].
+        output_names: of the n_y outputs.
+        component_mean: (S, n, n_y) mean for each draw.
+        component_variance: (S, n, n_y) variance of the noise-free output for each draw.
+        noise_variance: (S, n_y) variance of the measurement noise for each draw.
+        parts: share of the variance (n, n_y) by cause; they add up to the variance.
+        sampler: draws joint samples (S', n, n_y); called once.
+        kind: what was predicted, in words.
+    """
+
+    time: np.ndarray
+    output_names: tuple[str, ...]
+    component_mean: np.ndarray
+    component_variance: np.ndarray
+    noise_variance: np.ndarray
+    parts: Mapping[str, np.ndarray]
+    sampler: Callable[[], np.ndarray]
+    kind: str
+
+    @cached_property
+    def mean(self) -> np.ndarray:
+        """(n, n_y)."""
+        return self.component_mean.mean(0)
+
+    @cached_property
+    def variance(self) -> np.ndarray:
+        """(n, n_y): of measured outputs, measurement noise included."""
+        return self.signal_variance + self.noise_variance.mean(0)
+
+    @property
+    def sd(self) -> np.ndarray:
+        """(n, n_y): standard deviation of measured outputs, measurement noise included."""
+        return np.sqrt(self.variance)
+
+    @property
+    def signal_variance(self) -> np.ndarray:
+        """(n, n_y): of the noise-free outputs."""
+        return self.component_variance.mean(0) + self.component_mean.var(0)
+
+    @property
+    def signal_sd(self) -> np.ndarray:
+        """(n, n_y): standard deviation of the noise-free outputs."""
+        return np.sqrt(self.signal_variance)
+
+    @cached_property
+    def component_sd(self) -> np.ndarray:
+        """(S, n, n_y): standard deviation of measured outputs for each draw."""
+        return np.sqrt(self.component_variance + self.noise_variance[:, None, :])
+
+    @cached_property
+    def samples(self) -> np.ndarray:
+        """Joint samples (S', n, n_y) of measured outputs."""
+        return self.sampler()
+
+    def quantile(self, q: Any) -> np.ndarray:
+        """Quantiles of measured outputs.
+
+        Args:
+            q: probability in (0, 1), or several.
+
+        Returns:
+            (n, n_y) for one probability, (len(q), n, n_y) for several.
+        """
+        levels = np.atleast_1d(np.asarray(q, dtype=float))
+        if not ((levels > 0) & (levels < 1)).all():
+            raise invalid("q", expected="probabilities between 0 and 1", got=repr(q))
+        out = np.stack([self._quantile(float(level)) for level in levels])
+        return out[0] if np.ndim(q) == 0 else out
+
+    def _quantile(self, level: float) -> np.ndarray:
+        mean, sd = self.component_mean, self.component_sd
+        ends = mean + ndtri(level) * sd
+        low, high = ends.min(0), ends.max(0)  # the quantile of a mixture lies between these
+        if mean.shape[0] == 1:
+            return low
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            below = ndtr((middle - mean) / sd).mean(0) < level
+            low, high = np.where(below, middle, low), np.where(below, high, middle)
+        return 0.5 * (low + high)
+
+    def log_density(self, outputs: np.ndarray) -> np.ndarray:
+        """Log-density (n, n_y) of each measured output by itself; NaN where it is missing."""
+        z = (outputs - self.component_mean) / self.component_sd
+        terms = -0.5 * z**2 - np.log(self.component_sd) - 0.5 * np.log(2.0 * np.pi)
+        return logsumexp(terms, axis=0) - np.log(len(terms))
+
+    def probability_integral(self, outputs: np.ndarray) -> np.ndarray:
+        """Predictive distribution function (n, n_y) at the measured outputs."""
+        return ndtr((outputs - self.component_mean) / self.component_sd).mean(0)
+
+    def to_frame(self) -> pd.DataFrame:
+        """Table of mean, sd and the 95 % interval of every output, indexed by time."""
+        low, high = self.quantile([0.025, 0.975])
+        columns = {}
+        for a, name in enumerate(self.output_names):
+            columns[f"{name} mean"] = self.mean[:, a]
+            columns[f"{name} sd"] = self.sd[:, a]
+            columns[f"{name} 2.5 %"] = low[:, a]
+            columns[f"{name} 97.5 %"] = high[:, a]
+        return pd.DataFrame(columns, index=pd.Index(self.time, name="time"))
+
+    def __len__(self) -> int:
+        return len(self.time)

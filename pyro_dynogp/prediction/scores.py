@@ -1,0 +1,104 @@
+"""Scores of a prediction against measured outputs, in the units of the record."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scoringrules
+
+from pyro_dynogp._errors import invalid
+from pyro_dynogp.prediction.prediction import Prediction
+from pyro_dynogp.record import Record
+
+
+def scores(prediction: Prediction, record: Record, skip: int = 0) -> dict[str, Any]:
+    """Compare a prediction with the outputs of a record.
+
+    Args:
+        prediction: of the same times as the record.
+        record: with measured outputs; missing ones are left out.
+        skip: number of initial samples to leave out (a state-initialisation window).
+
+    Returns:
+        For one output numbers, for several arrays (n_y,):
+
+        - ``rmse``, ``mae`` [output]: of the predictive mean.
+        - ``nrmse``: rmse over the standard deviation of the measured output.
+        - ``fit_percent``: 100 (1 - nrmse), the fit index of system identification [%].
+        - ``crps`` [output]: continuous ranked probability score, exact for the normal mixture
+          (Gneiting & Raftery 2007; computed by scoringrules).
+        - ``negative_log_density`` [nats per sample]: of each sample by itself.
+        - ``coverage_50``, ``coverage_95``: share of samples within the central intervals.
+        - ``count``: number of samples scored.
+
+    Raises:
+        ValueError: where times differ, no output is left, or skip is out of range.
+    """
+    if len(prediction) != len(record) or not np.array_equal(prediction.time, record.time):
+        raise invalid(
+            "prediction",
+            expected=f"the {len(record)} times of the record",
+            got=f"{len(prediction)} times"
+            if len(prediction) != len(record)
+            else "other times of the same number",
+            advice="Score a prediction with the record that it was made for.",
+        )
+    if record.n_outputs != prediction.mean.shape[1]:
+        raise invalid(
+            "record",
+            expected=f"{prediction.mean.shape[1]} measured outputs",
+            got=str(record.n_outputs),
+        )
+    if not 0 <= skip < len(record):
+        raise invalid("skip", expected=f"a number from 0 to {len(record) - 1}", got=repr(skip))
+    y = record.outputs
+    low50, high50, low95, high95 = prediction.quantile([0.25, 0.75, 0.025, 0.975])
+    density = prediction.log_density(y)
+    columns: dict[str, list[float]] = {}
+    for a in range(y.shape[1]):
+        there = np.isfinite(y[:, a])
+        there[:skip] = False
+        if not there.any():
+            raise invalid(
+                "record", expected=f"measured samples of {record.output_names[a]}", got="none"
+            )
+        target = y[there, a]
+        error = target - prediction.mean[there, a]
+        spread = float(target.std())
+        rmse = float(np.sqrt(np.mean(error**2)))
+        nrmse = rmse / spread if spread > 0 else float("nan")
+        values = {
+            "rmse": rmse,
+            "mae": float(np.mean(np.abs(error))),
+            "nrmse": nrmse,
+            "fit_percent": 100.0 * (1.0 - nrmse),
+            "crps": _crps(prediction, there, a, target),
+            "negative_log_density": -float(np.mean(density[there, a])),
+            "coverage_50": _inside(target, low50[there, a], high50[there, a]),
+            "coverage_95": _inside(target, low95[there, a], high95[there, a]),
+            "count": int(there.sum()),
+        }
+        for name, value in values.items():
+            columns.setdefault(name, []).append(value)
+    if y.shape[1] == 1:
+        return {name: values[0] for name, values in columns.items()}
+    return {name: np.asarray(values) for name, values in columns.items()}
+
+
+def _inside(y: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
+    return float(np.mean((y >= low) & (y <= high)))
+
+
+def _crps(prediction: Prediction, there: np.ndarray, a: int, y: np.ndarray) -> float:
+    mean = prediction.component_mean[:, there, a]
+    sd = prediction.component_sd[:, there, a]
+    if len(mean) == 1:
+        return float(np.mean(scoringrules.crps_normal(y, mean[0], sd[0])))
+    # The mixture's score is quadratic in the number of draws: blocks bound the memory.
+    block = max(1, int(2e7 / len(mean) ** 2))
+    parts = [
+        scoringrules.crps_mixnorm(y[i : i + block], mean[:, i : i + block].T, sd[:, i : i + block].T)
+        for i in range(0, len(y), block)
+    ]
+    return float(np.mean(np.concatenate([np.atleast_1d(part) for part in parts])))
