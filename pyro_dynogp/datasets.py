@@ -14,9 +14,9 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from ._errors import invalid
-from .record import Record
-from .simulators import Simulation, Truth, simulate_lti, simulate_wiener
+from pyro_dynogp._errors import invalid
+from pyro_dynogp.record import Record
+from pyro_dynogp.simulators import Simulation, Truth, simulate_lti, simulate_wiener
 
 _DAISY = "B. De Moor (ed.), DaISy: Database for the Identification of Systems, KU Leuven"
 _DRIVES = (

@@ -27,9 +27,7 @@ class LTIParameters(gpytorch.Module):
     def __init__(self, modes: Modes) -> None:
         super().__init__()
         if modes.batch_shape or modes.several_outputs:
-            raise invalid(
-                "modes", expected="one output and no batch dimensions", got=repr(modes)
-            )
+            raise invalid("modes", expected="one output and no batch dimensions", got=repr(modes))
         self.noise = modes.noise
         poles = modes.poles.detach()
         values = {
@@ -103,9 +101,7 @@ class LTIMean(gpytorch.means.Mean):
     prediction of `ExactGP`, which appends the test rows to the training rows, carries the state on.
     """
 
-    def __init__(
-        self, system: Modes | LTIParameters, time: Any = None, inputs: Any = None
-    ) -> None:
+    def __init__(self, system: Modes | LTIParameters, time: Any = None, inputs: Any = None) -> None:
         super().__init__()
         self.system = _parameters(system)
         if (time is None) != (inputs is None):

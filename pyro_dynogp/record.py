@@ -19,10 +19,20 @@ import xarray as xr
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ._errors import invalid
-
-Array = NDArray[np.float64]
-Names = str | Sequence[str] | None
+from pyro_dynogp._errors import invalid
+from pyro_dynogp._record_checks import (
+    Array,
+    Names,
+    as_channels,
+    as_instant,
+    as_names,
+    as_texts,
+    check_finite,
+    check_unique,
+    frozen,
+    nanoseconds,
+    read_clock,
+)
 
 
 @dataclass(frozen=True)
@@ -104,32 +114,32 @@ class Record:
     ) -> None:
         if not isinstance(time_unit, str):
             raise invalid("time_unit", expected='text such as "s" or "h"', got=repr(time_unit))
-        clock, origin = _clock(time, start, time_unit)
+        clock, origin = read_clock(time, start, time_unit)
         n = len(clock)
-        u = _channels("inputs", inputs, n)
-        y = _channels("outputs", outputs, n)
-        u_names = _texts("input_names", input_names, u.shape[1], default="u")
-        y_names = _texts("output_names", output_names, y.shape[1], default="y")
-        _check_finite("inputs", u, u_names, missing_allowed=False)
-        _check_finite("outputs", y, y_names, missing_allowed=True)
+        u = as_channels("inputs", inputs, n)
+        y = as_channels("outputs", outputs, n)
+        u_names = as_texts("input_names", input_names, u.shape[1], default="u")
+        y_names = as_texts("output_names", output_names, y.shape[1], default="y")
+        check_finite("inputs", u, u_names, missing_allowed=False)
+        check_finite("outputs", y, y_names, missing_allowed=True)
         kept: dict[str, Array] = {}
         for key, value in (extra or {}).items():
-            kept[key] = _channels(f"extra[{key!r}]", value, n, columns=1)[:, 0]
-            _check_finite(f"extra[{key!r}]", kept[key][:, None], (key,), missing_allowed=True)
-        _check_unique((*u_names, *y_names, *_texts("extra", tuple(kept), len(kept))))
+            kept[key] = as_channels(f"extra[{key!r}]", value, n, columns=1)[:, 0]
+            check_finite(f"extra[{key!r}]", kept[key][:, None], (key,), missing_allowed=True)
+        check_unique((*u_names, *y_names, *as_texts("extra", tuple(kept), len(kept))))
         unknown = sorted(set(extra_units or {}) - set(kept))
         if unknown:
             raise invalid("extra_units", expected=f"names of extra {list(kept)}", got=f"{unknown}")
         stored = {
-            "time": _frozen(clock),
-            "inputs": _frozen(u),
-            "outputs": _frozen(y),
+            "time": frozen(clock),
+            "inputs": frozen(u),
+            "outputs": frozen(y),
             "input_names": u_names,
             "output_names": y_names,
-            "input_units": _texts("input_units", input_units, len(u_names), unique=False),
-            "output_units": _texts("output_units", output_units, len(y_names), unique=False),
+            "input_units": as_texts("input_units", input_units, len(u_names), unique=False),
+            "output_units": as_texts("output_units", output_units, len(y_names), unique=False),
             "time_unit": time_unit,
-            "extra": MappingProxyType({k: _frozen(v) for k, v in kept.items()}),
+            "extra": MappingProxyType({k: frozen(v) for k, v in kept.items()}),
             "extra_units": MappingProxyType({k: (extra_units or {}).get(k, "") for k in kept}),
             "name": str(name),
             "start": origin,
@@ -222,7 +232,7 @@ class Record:
             return None
         tick = 1 if np.abs(self.time).max() < 100 * 86400 else 1000
         elapsed = np.rint(self.time * (1e9 / tick)).astype(np.int64) * tick
-        stamps = pd.to_datetime(_nanoseconds(self.start) + elapsed, unit="ns", utc=True)
+        stamps = pd.to_datetime(nanoseconds(self.start) + elapsed, unit="ns", utc=True)
         return stamps.tz_convert(self.start.tz)
 
     @cached_property
@@ -313,7 +323,7 @@ class Record:
         if isinstance(at, (str, datetime.datetime)):
             if self.timestamps is None:
                 raise invalid("at", expected="a sample index (no time stamps here)", got=f"{at!r}")
-            k = int(self.timestamps.searchsorted(_instant("at", at)))
+            k = int(self.timestamps.searchsorted(as_instant("at", at)))
         elif isinstance(at, (int, np.integer)) and not isinstance(at, bool):
             k = int(at)
         else:
@@ -355,13 +365,13 @@ class Record:
         Raises:
             ValueError: an unknown name, or one chosen twice.
         """
-        chosen_u = self.input_names if inputs is None else _names(inputs)
-        chosen_y = self.output_names if outputs is None else _names(outputs)
+        chosen_u = self.input_names if inputs is None else as_names(inputs)
+        chosen_y = self.output_names if outputs is None else as_names(outputs)
         values, units = self._columns()
         for name in (*chosen_u, *chosen_y):
             if name not in values:
                 raise invalid("select", expected=f"names among {list(values)}", got=repr(name))
-        _check_unique((*chosen_u, *chosen_y))
+        check_unique((*chosen_u, *chosen_y))
         rest = [name for name in values if name not in (*chosen_u, *chosen_y)]
         empty = np.empty((len(self), 0))
         return dataclasses.replace(
@@ -394,7 +404,7 @@ class Record:
             names: their names; None keeps the names and units, if the number is the same.
             units: their units; None keeps the units, if the number is the same.
         """
-        new = _channels("outputs", outputs, len(self))
+        new = as_channels("outputs", outputs, len(self))
         same_number = new.shape[1] == self.n_outputs
         if names is None and not same_number:
             raise invalid(
@@ -404,10 +414,10 @@ class Record:
         return dataclasses.replace(
             self,
             outputs=new,
-            output_names=self.output_names if names is None else _names(names),
+            output_names=self.output_names if names is None else as_names(names),
             output_units=(self.output_units if same_number else ("",) * new.shape[1])
             if units is None
-            else _names(units),
+            else as_names(units),
         )
 
     def tensors(self) -> RecordTensors:
@@ -513,186 +523,3 @@ def as_records(records: Record | Sequence[Record]) -> tuple[Record, ...]:
 
 def _rebuild(fields: dict[str, Any]) -> Record:
     return Record(**fields)
-
-
-def _frozen(array: Array) -> Array:
-    copy = np.array(array, dtype=np.float64, order="C")
-    copy.setflags(write=False)
-    return copy
-
-
-def _numbers(argument: str, value: Any) -> Array:
-    """Real numbers as float64; what is no number is refused, never parsed."""
-    if isinstance(value, Tensor):
-        value = value.detach().cpu()
-        value = (value if value.is_complex() else value.to(torch.float64)).numpy()
-    elif isinstance(value, np.ma.MaskedArray):  # np.asarray would drop the mask
-        value = np.ma.filled(value.astype(np.float64), np.nan)
-    expected = "real numbers"
-    try:
-        array = np.asarray(value)
-        if array.dtype.kind == "O":  # None, pandas' NA, Decimal
-            text = next((v for v in array.ravel() if isinstance(v, (str, bytes))), None)
-            if text is not None:
-                raise invalid(argument, expected=expected, got=f"the text {text!r}")
-            array = np.where(pd.isna(array), np.nan, array).astype(np.float64)
-    except (TypeError, ValueError) as error:
-        if str(error).startswith(f"{argument}: "):
-            raise
-        raise invalid(
-            argument, expected=expected, got=f"{type(value).__name__}: {error}"
-        ) from error
-    if array.dtype.kind not in "biuf":
-        raise invalid(
-            argument, expected=expected, got=f"an array of type {array.dtype}",
-            advice="Convert it first; text columns are read by Record.from_csv.",
-        )  # fmt: skip
-    return array.astype(np.float64)
-
-
-def _channels(argument: str, value: Any, n: int, columns: int | None = None) -> Array:
-    """Channels as (n, number of channels)."""
-    array = np.empty((n, 0)) if value is None else _numbers(argument, value)
-    if array.ndim == 1:
-        array = array[:, None]
-    if array.ndim != 2 or len(array) != n or (columns is not None and array.shape[1] != columns):
-        turned = array.ndim == 2 and array.shape[1] == n
-        raise invalid(
-            argument,
-            expected=f"shape ({n},)" + ("" if columns == 1 else f" or ({n}, channels)"),
-            got=f"shape {np.shape(value)}",
-            advice="Transpose it: one row for each sample." if turned else "",
-        )
-    return array
-
-
-def _check_finite(
-    argument: str, array: Array, names: tuple[str, ...], *, missing_allowed: bool
-) -> None:
-    bad = np.isinf(array) if missing_allowed else ~np.isfinite(array)
-    if not bad.any():
-        return
-    column = int(np.argmax(bad.any(axis=0)))
-    rows = np.flatnonzero(bad[:, column])
-    shown = ", ".join(map(str, rows[:5])) + (", ..." if len(rows) > 5 else "")
-    raise invalid(
-        argument,
-        expected="finite numbers" + (" or NaN (missing)" if missing_allowed else ""),
-        got=f"{array[rows[0], column]} in column {names[column]!r}, {len(rows)} rows: {shown}",
-        advice="Write NaN where a sample is missing."
-        if missing_allowed
-        else "Fill the gaps by what the input was, or drop them by slicing into several records.",
-    )
-
-
-def _names(value: str | Sequence[str]) -> tuple[str, ...]:
-    return (value,) if isinstance(value, str) else tuple(value)
-
-
-def _check_unique(names: tuple[str, ...]) -> None:
-    for name in names:
-        if names.count(name) > 1:
-            raise invalid(
-                "names", expected="each channel name once among inputs, outputs and extra",
-                got=f"{name!r} {names.count(name)} times",
-            )  # fmt: skip
-
-
-def _texts(
-    argument: str, value: Names, count: int, *, default: str = "", unique: bool = True
-) -> tuple[str, ...]:
-    """Names or units, one for each channel."""
-    if value is None:
-        several = default and count > 1
-        return tuple(f"{default}{i + 1}" if several else default for i in range(count))
-    texts = _names(value)
-    wrong = [t for t in texts if not isinstance(t, str) or (unique and not t)]
-    if wrong or len(texts) != count:
-        raise invalid(argument, expected=f"{count} non-empty texts" if unique else f"{count} texts",
-                      got=f"{len(texts)}: {list(texts)}")  # fmt: skip
-    return texts
-
-
-def _nanoseconds(stamp: pd.Timestamp) -> int:
-    return int(stamp.as_unit("ns").value)
-
-
-def _naive(argument: str) -> ValueError:
-    return invalid(
-        argument,
-        expected="time stamps with a time zone",
-        got="stamps without one",
-        advice="Local times without their zone are ambiguous (daylight saving). Localise them: "
-        'pd.DatetimeIndex(...).tz_localize("UTC"), or the time zone of the plant.',
-    )
-
-
-def _instant(argument: str, value: Any) -> pd.Timestamp:
-    try:
-        stamp = pd.Timestamp(value)
-    except (TypeError, ValueError) as error:
-        raise invalid(argument, expected="a time stamp", got=repr(value)) from error
-    if pd.isna(stamp) or stamp.tz is None:
-        raise _naive(argument)
-    return stamp
-
-
-def _stamps(value: Any) -> pd.DatetimeIndex | None:
-    """Time stamps with their zone, or None where `value` holds no stamps."""
-    if isinstance(value, Tensor):
-        return None
-    if not isinstance(value, (pd.DatetimeIndex, pd.Series)):
-        array = np.asarray(value)
-        if array.dtype.kind == "M":
-            raise _naive("time")
-        if array.ndim != 1 or not any(isinstance(t, datetime.datetime) for t in array[:1]):
-            return None
-        if any(getattr(t, "tzinfo", None) is None for t in array):
-            raise _naive("time")
-        # Daylight saving gives one zone two offsets, so convert by way of UTC.
-        return pd.DatetimeIndex(pd.to_datetime(list(array), utc=True)).tz_convert(array[0].tzinfo)
-    if not pd.api.types.is_datetime64_any_dtype(value.dtype):
-        return None
-    index = pd.DatetimeIndex(value)
-    if index.tz is None:
-        raise _naive("time")
-    return index
-
-
-def _clock(time: Any, start: Any, time_unit: str) -> tuple[Array, pd.Timestamp | None]:
-    """Time (n,) as increasing numbers, and the instant of time zero."""
-    origin = None if start is None else _instant("start", start)
-    index = _stamps(time)
-    if index is not None:
-        if not len(index):
-            raise invalid("time", expected="one sample or more", got="an empty record")
-        if index.hasnans:
-            row = int(np.flatnonzero(index.isna())[0])
-            raise invalid("time", expected="a time stamp for each sample", got=f"none in row {row}")
-        if origin is None:
-            origin = index[0]
-        clock = (index.as_unit("ns").asi8 - _nanoseconds(origin)) / 1e9
-    else:
-        clock = _numbers("time", time)
-    if origin is not None and time_unit != "s":
-        raise invalid("time_unit", expected='"s" with time stamps', got=repr(time_unit))
-    if clock.ndim != 1:
-        raise invalid("time", expected="shape (n,)", got=f"shape {clock.shape}")
-    if not len(clock):
-        raise invalid("time", expected="one sample or more", got="an empty record")
-    if not np.isfinite(clock).all():
-        row = int(np.flatnonzero(~np.isfinite(clock))[0])
-        raise invalid("time", expected="finite numbers", got=f"{clock[row]} in row {row}")
-    steps = np.diff(clock)
-    if (steps <= 0).any():
-        k = int(np.flatnonzero(steps <= 0)[0])
-        pair = (clock[k], clock[k + 1]) if index is None else (index[k], index[k + 1])
-        raise invalid(
-            "time",
-            expected="strictly increasing times",
-            got=f"{'a repeated time stamp' if steps[k] == 0 else 'a step back'} at index {k + 1}: "
-            f"{pair[0]} then {pair[1]}",
-            advice="Sort the rows by time; keep one row for each time, or give repeated "
-            "experiments as several records.",
-        )
-    return clock, origin

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ._errors import invalid
-from .record import Array, Record, as_records
+from pyro_dynogp._errors import invalid
+from pyro_dynogp._record_checks import Array
+from pyro_dynogp.record import Record, as_records
 
 _ARRAYS = ("input_offset", "input_scale", "output_offset", "output_scale")
 _NAMES = ("input_names", "output_names", "input_units", "output_units")

@@ -177,7 +177,7 @@ def test_lti_truth():
         run = simulate_lti(seed)
         truth = run.truth
         assert truth.A.shape == (10, 10)
-        assert 0.01 <= truth.process_noise_share <= 0.05
+        assert 0.001 <= truth.process_noise_share <= 0.01
         poles = truth.poles
         assert len(np.unique(np.round(poles.imag, 9))) == 10  # five pairs, none real
         frequency, damping = np.abs(poles), -poles.real / np.abs(poles)

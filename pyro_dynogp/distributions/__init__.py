@@ -1,0 +1,1 @@
+"""Trajectories of stochastic LTI systems as Pyro distributions."""

@@ -42,8 +42,8 @@ class LTIProcess(Trajectory):
             without it. It plays no part in `observed`.
         offset: constant added to the mean [output], of batch shape (*b), or (*b, n_y).
 
-    Batch shape: that of modes, inputs, initial state and offset, broadcast. Event shape: (n,) for one
-    output, (n, n_y) for modes with an output dimension. dtype float64.
+    Batch shape: that of modes, inputs, initial state and offset, broadcast. Event shape: (n,) for
+    one output, (n, n_y) for modes with an output dimension. dtype float64.
 
     Raises:
         ValueError: on shapes that do not fit, times that decrease, NaN in the inputs.

@@ -1,0 +1,1 @@
+"""Fitting: starts, posterior mode, variational inference, NUTS, and the frozen result."""

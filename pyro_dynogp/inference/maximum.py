@@ -114,9 +114,7 @@ def maximise(
 
     def climb(values: Sequence[dict[str, Tensor]], count: int, label: str) -> list[Optimum]:
         tasks = [_Task(model, records, value, optimizer, count, seed) for value in values]
-        return parallel_map(
-            _optimise, tasks, workers=workers, progress=progress, description=label
-        )
+        return parallel_map(_optimise, tasks, workers=workers, progress=progress, description=label)
 
     def best_first(optima: list[Optimum]) -> list[Optimum]:
         return sorted(optima, key=lambda optimum: optimum.energy)

@@ -46,9 +46,7 @@ class Potential:
             if node["type"] == "sample" and name in values:
                 value = node["value"].detach()
                 transform = biject_to(node["fn"].support)
-                self.sites.append(
-                    Site(name, value.shape, transform.inv(value).shape, transform)
-                )
+                self.sites.append(Site(name, value.shape, transform.inv(value).shape, transform))
 
     @property
     def size(self) -> int:

@@ -106,7 +106,16 @@ def sample_posterior(
     root = laplace_root(potential.hessian(z), widest=3.0)
     tasks = [
         _Task(
-            model, records, values, z, root, draws, warmup, target_accept, child, progress and i == 0
+            model,
+            records,
+            values,
+            z,
+            root,
+            draws,
+            warmup,
+            target_accept,
+            child,
+            progress and i == 0,
         )
         for i, child in enumerate(child_seeds(seed, chains))
     ]

@@ -14,7 +14,7 @@ from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import held_states
 from pyro_dynogp.models.linear import LinearDynamicGP
-from pyro_dynogp.models.priors import HORSESHOE_SCALE, TimeScale
+from pyro_dynogp.models.priors import HORSESHOE_SCALE, TimeScale, numerators
 from pyro_dynogp.record import Record
 from pyro_dynogp.scaling import Scaling
 
@@ -87,8 +87,10 @@ def _given_poles(
                 direction[:, j], B[j] = left[:, 0] * turn, size[0] * right[0] / turn
         values["g.output_gain"] = np.stack([direction.real, direction.imag], -1)
     if n_u:
-        scaled = B / rate[:, None]
-        values["g.input_gain"] = np.stack([scaled.real, scaled.imag], -1)
+        # From residues to sections: b1 = g1 |lambda|, b0 = g0 |lambda|^2.
+        section = numerators(torch.as_tensor(poles), torch.as_tensor(B)).numpy()
+        section = section / np.stack([rate, rate**2], -1)[:, None, :]
+        values["g.input_gain"] = np.clip(section, -10.0, 10.0)
         if model.feedthrough:
             D = weights[:, 2 * P * n_u : -1]
             values["g.feedthrough"] = D if model.several_outputs else D[0]
@@ -96,13 +98,12 @@ def _given_poles(
         brownian = model.brownian or n_y
         share = 0.3 * float(spread.mean()) / math.sqrt(P * brownian)
         values["g.noise_gain.local_scale"] = np.full(P, math.sqrt(share / HORSESHOE_SCALE))
-        unit = np.zeros((P, brownian, 2))
-        unit[..., 0] = math.sqrt(share / HORSESHOE_SCALE)
+        unit = np.full((P, brownian, 2), math.sqrt(0.5 * share / HORSESHOE_SCALE))
         values["g.noise_gain.unit"] = unit
     if model.initial_state == "site":
         suffixes = [""] if len(records) == 1 else [f".{i}" for i in range(len(records))]
         for suffix in suffixes:
-            values[f"initial_state{suffix}"] = np.zeros((P, 2))
+            values[f"initial_state{suffix}"] = np.zeros(2 * P)
     tensors = {name: torch.tensor(value, dtype=torch.float64) for name, value in values.items()}
     return float(np.nanmean(residual**2)), tensors
 

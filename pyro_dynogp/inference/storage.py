@@ -51,7 +51,7 @@ def save(fit: Fit, path: str | Path) -> None:
         "seed": fit.seed,
         "training": list(fit.training),
         "diagnostics": dict(fit.diagnostics),
-        "sites": [name for name in fit.draws],
+        "sites": list(fit.draws),
     }
     clones = {name: value.clone() for name, value in tensors.items()}
     save_file(clones, str(path), metadata={FORMAT: json.dumps(header)})

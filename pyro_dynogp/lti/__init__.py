@@ -1,0 +1,1 @@
+"""Mathematics of stochastic linear time-invariant systems: tensors in, tensors out, no Pyro."""

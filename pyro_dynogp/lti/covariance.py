@@ -55,7 +55,7 @@ def state_covariance(modes: Modes) -> Tensor:
 
 
 def state_output_covariance(modes: Modes) -> Tensor:
-    """q (*b, n_y, P), complex: the covariance of each mode with each output."""
+    """Q (*b, n_y, P), complex: the covariance of each mode with each output."""
     hermitian, symmetric = modal_covariance(modes)
     C = modes.C
     return (hermitian @ C.mH + symmetric @ C.mT).mT

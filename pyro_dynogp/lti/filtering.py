@@ -125,9 +125,7 @@ def predict_k_steps(
     re, im, lam, h, g, k0, v, S0, Y = (array(x) for x in flat)
     grid = covariance.grid
     time: Any = array(grid.time)
-    mean, variance = _k_step(
-        re, im, grid.step_index, lam, time, h, g, k0, v, S0, Y, int(horizon)
-    )
+    mean, variance = _k_step(re, im, grid.step_index, lam, time, h, g, k0, v, S0, Y, int(horizon))
     shape = (*batch, covariance.size)
     return KStepPrediction(
         torch.from_numpy(mean).reshape(shape),

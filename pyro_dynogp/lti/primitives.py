@@ -40,6 +40,7 @@ class Generators:
 
 
 def array(x: Tensor) -> np.ndarray:
+    """Contiguous array of a tensor's values."""
     return np.ascontiguousarray(x.detach().resolve_conj().cpu().numpy())
 
 
@@ -109,9 +110,7 @@ class _LaterInformation(_Recursion):
     def backward(ctx: Any, kappa_bar: Tensor) -> Any:  # type: ignore[override]
         re, im, h, e, d = (array(a) for a in ctx.saved_tensors)
         step, out = ctx.index
-        grads = recursions.later_information_adjoint(
-            re, im, step, out, h, e, d, array(kappa_bar)
-        )
+        grads = recursions.later_information_adjoint(re, im, step, out, h, e, d, array(kappa_bar))
         return (None, None, *_Recursion.tensors(kappa_bar, *grads))
 
 

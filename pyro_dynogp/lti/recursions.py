@@ -210,7 +210,7 @@ def factor_adjoint(re, im, step, out, h, g, k0, v, S0, e_bar, p_bar, S_end_bar):
                         Q[:] = starts[segment]
                     _rotate_columns(Q, re[b, k], im[b, k])
                     for j in range(J):
-                        for l in range(J):  # noqa: E741
+                        for l in range(J):
                             Q[j, l] *= 2.0
                     _add_step_gradient(bar, Q, re_bar[b, k], im_bar[b, k])
                     _rotate_rows(bar, re[b, k], back[b, k])
@@ -427,7 +427,7 @@ def later_information_adjoint(re, im, step, out, h, e, d, kappa_bar):
                     # gradient of <bar, Phi' moved Phi>: 2 <moved Phi bar, Phi>
                     _rotate_columns(bar, re[b, k], im[b, k])
                     for j in range(J):
-                        for l in range(J):  # noqa: E741
+                        for l in range(J):
                             moved[j, l] *= 2.0
                     _add_step_gradient(moved, bar, re_bar[b, k], im_bar[b, k])
                     _rotate_rows(bar, re[b, k], im[b, k])

@@ -205,7 +205,6 @@ class SemiseparableCovariance:
         )
         return both.signal_matmul(padded)[..., theirs, :]
 
-
     def inverse_diagonal(self) -> Tensor:
         """Diagonal of K^{-1} (*b, N); zero in missing rows."""
         d = self.innovation_variance

@@ -1,0 +1,1 @@
+"""Models as Pyro functions, and the priors they are made of."""

@@ -15,7 +15,7 @@ from torch import Tensor
 from pyro_dynogp._errors import invalid
 from pyro_dynogp._tensors import as_tensor
 from pyro_dynogp.distributions.process import LTIProcess
-from pyro_dynogp.lti.covariance import state_covariance
+from pyro_dynogp.lti.covariance import real_covariance, state_covariance
 from pyro_dynogp.lti.modes import Modes, NoiseStructure
 from pyro_dynogp.lti.state import ModalState
 from pyro_dynogp.models.priors import FLAT, PriorName, TimeScale, sample_modes
@@ -33,13 +33,13 @@ class LinearSystem:
         modes: poles and gains, batch shape *b.
         offset: (*b,) or (*b, n_y): mean output at the mean inputs of the training record.
         noise_sd: (*b,) or (*b, n_y): measurement noise [output].
-        initial_sd: (*b, P): prior standard deviation of Re and Im of the initial state.
+        past_inputs: (*b, 2P, 2P): covariance that unknown past inputs give the initial state.
     """
 
     modes: Modes
     offset: Tensor
     noise_sd: Tensor
-    initial_sd: Tensor
+    past_inputs: Tensor
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class LinearDynamicGP:
 
     Sites: those of `sample_modes` under the prefix ``g``, ``offset`` and ``noise_sd`` (n_y,) in
     standard deviations of the training output (normal(0, 1) and log-normal around 0.1), and with
-    ``initial_state="site"`` ``initial_state`` (P, 2).
+    ``initial_state="site"`` ``initial_state`` (2P,), standard normal.
 
     Args:
         inputs: n_u, may be 0. outputs: n_y. pairs: P, the number of conjugate pairs (order 2P).
@@ -61,8 +61,9 @@ class LinearDynamicGP:
         brownian: n_l, number of Brownian motions; by default n_y.
         feedthrough: whether the input acts on the output at once.
         process_noise: whether there is any.
-        initial_state: "integrated", a Gaussian as wide as the largest state that inputs of one
-            standard deviation can hold, integrated out; "zero"; or "site", sampled.
+        initial_state: "integrated", what unknown past inputs of one standard deviation and past
+            process noise would have left, a Gaussian, integrated out; "zero" (but for the past
+            process noise); or "site", sampled.
         priors: "default", or "paper" for flat ones but for the horseshoe on the noise gains.
         scaling: what one time step and one standard deviation are; learnt by `fit` from the
             training record. Without it the record that the model is called with sets them.
@@ -98,9 +99,7 @@ class LinearDynamicGP:
         if self.priors not in ("default", "paper"):
             raise invalid("priors", expected="'default' or 'paper'", got=repr(self.priors))
         if self.inputs == 0 and not self.process_noise:
-            raise invalid(
-                "process_noise", expected="True for a system without inputs", got="False"
-            )
+            raise invalid("process_noise", expected="True for a system without inputs", got="False")
 
     def scaled_to(self, records: Record | Sequence[Record]) -> LinearDynamicGP:
         """The same model with the scaling of the given training record(s)."""
@@ -138,6 +137,7 @@ class LinearDynamicGP:
         """Sample all hyperparameters; the result is in the units of the record."""
         n_y = self.outputs
         several = self.several_outputs
+        time_scale = TimeScale(float(scaling.time_step), float(scaling.duration))
         modes = sample_modes(
             "g",
             inputs=self.inputs,
@@ -147,7 +147,7 @@ class LinearDynamicGP:
             noise=self.noise,
             feedthrough=self.feedthrough,
             process_noise=self.process_noise,
-            time_scale=TimeScale(float(scaling.time_step), float(scaling.duration)),
+            time_scale=time_scale,
             priors=self.priors,
         )
         flat = self.priors == "paper"
@@ -159,8 +159,6 @@ class LinearDynamicGP:
             "noise_sd",
             dist.LogNormal(zero + math.log(0.1), zero + (FLAT if flat else 1.5)).to_event(1),
         )
-        # |x_j| <= |B_j| max|u| / decay_j: no input of one standard deviation holds more.
-        reach = modes.B.abs().square().sum(-1).sqrt() / -modes.poles.real
         y_scale = as_tensor(scaling.output_scale)
         y_offset = as_tensor(scaling.output_offset)
         shift, sd = y_offset + y_scale * offset, y_scale * noise_sd
@@ -170,7 +168,7 @@ class LinearDynamicGP:
             else modes.rescale(inputs=as_tensor(scaling.input_scale), outputs=y_scale[0]),
             offset=shift if several else shift.squeeze(-1),
             noise_sd=sd if several else sd.squeeze(-1),
-            initial_sd=reach,
+            past_inputs=past_input_covariance(modes, 1.0 / time_scale.typical_rate),
         )
 
     def process(
@@ -199,9 +197,8 @@ class LinearDynamicGP:
     @staticmethod
     def prior_state(system: LinearSystem, modes: Modes) -> ModalState:
         """Gaussian prior of the initial state: unknown past inputs plus past process noise."""
-        var = torch.cat([system.initial_sd, system.initial_sd], -1).square()
         mean = torch.zeros_like(modes.poles)
-        return ModalState(mean, state_covariance(modes) + torch.diag_embed(var))
+        return ModalState(mean, state_covariance(modes) + system.past_inputs)
 
     def __call__(self, records: Record | Sequence[Record]) -> None:
         """Run the Pyro model on one record or on several."""
@@ -213,9 +210,9 @@ class LinearDynamicGP:
             suffix = "" if single else f".{index}"
             state: Any = None
             if self.initial_state == "site":
-                one = torch.ones(self.pairs, 2, dtype=torch.float64)
-                z = pyro.sample(f"initial_state{suffix}", dist.Normal(0.0 * one, one).to_event(2))
-                state = torch.complex(z[..., 0], z[..., 1]) * system.initial_sd
+                one = torch.ones(2 * self.pairs, dtype=torch.float64)
+                z = pyro.sample(f"initial_state{suffix}", dist.Normal(0.0 * one, one).to_event(1))
+                state = initial_mean(system.past_inputs, z)
             process = self.process(system, record, scaling, state)
             outputs = record.tensors().outputs
             if not self.several_outputs and record.n_outputs:
@@ -225,3 +222,28 @@ class LinearDynamicGP:
                 process.observed(system.noise_sd),
                 obs=outputs if record.n_outputs else None,
             )
+
+
+def past_input_covariance(modes: Modes, memory: float) -> Tensor:
+    """Covariance (*b, 2P, 2P) of [Re x; Im x] after unknown past inputs of unit variance.
+
+    Each input is taken as the sum of a random constant, which holds the state at -B/lambda, and
+    of white noise of intensity 2 memory, as of an input that forgets within `memory` [s].
+    """
+    lam, B = modes.poles, modes.B
+    held = B / lam.unsqueeze(-1)
+    hermitian = held @ held.mH - 2.0 * memory * (B @ B.mH) / (
+        lam.unsqueeze(-1) + lam.conj().unsqueeze(-2)
+    )
+    symmetric = held @ held.mT - 2.0 * memory * (B @ B.mT) / (lam.unsqueeze(-1) + lam.unsqueeze(-2))
+    return real_covariance(hermitian, symmetric)
+
+
+def initial_mean(covariance: Tensor, standard: Tensor) -> Tensor:
+    """Initial state (*b, P), complex, with the given covariance, from standard normals (*b, 2P)."""
+    J = covariance.shape[-1]
+    ridge = 1e-9 * covariance.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] + 1e-150
+    eye = torch.eye(J, dtype=covariance.dtype)
+    root = torch.linalg.cholesky(covariance + ridge * eye)
+    x = (root @ standard.unsqueeze(-1)).squeeze(-1)
+    return torch.complex(x[..., : J // 2], x[..., J // 2 :])

@@ -5,7 +5,13 @@ and outputs in their standard deviations. The same record in hours or seconds, v
 gives the same posterior.
 
 Gauge: a single output has c_j = 1 (scale and phase of c_j, B_j and L_j are not separately
-identified); several outputs have c_j of unit length with a positive first entry.
+identified); several outputs have c_j of unit length with a positive first entry. Each pair is then
+a second-order section, and its gains are given as such a section's numerator,
+
+    G_j(s) = |lambda| (g1 s + g0 |lambda|) / ((s - lambda)(s - conj lambda)),
+
+so that g0 is the steady-state gain of the pair and g1 that of its derivative path. Residues
+(B_j = lim (s - lambda) G_j) would grow without bound as a pair becomes critically damped.
 """
 
 from __future__ import annotations
@@ -26,6 +32,8 @@ PriorName = Literal["default", "paper"]
 
 # Scale of the horseshoe on the noise gains (paper, appendix "Implementation").
 HORSESHOE_SCALE = 0.1
+# Least ratio of frequency to decay rate of a pair.
+CRITICAL = 0.02
 # Standard deviation of a prior that is flat for all practical purposes.
 FLAT = 1e3
 
@@ -85,19 +93,47 @@ def sample_poles(name: str, pairs: int, time_scale: TimeScale, priors: PriorName
 
         log_decay = pyro.sample(f"{name}.log_decay", uniform(low))
         log_frequency = pyro.sample(f"{name}.log_frequency", uniform(low - math.log(10.0)))
-    return torch.complex(-log_decay.exp(), log_frequency.exp())
+    decay = log_decay.exp()
+    # The floor is as good as a double real pole (relative error 4e-4) and keeps residues bounded.
+    frequency = (log_frequency.exp().square() + (CRITICAL * decay).square()).sqrt()
+    return torch.complex(-decay, frequency)
 
 
-def sample_horseshoe(name: str, *shape: int, scale: float = HORSESHOE_SCALE) -> Tensor:
+def residues(poles: Tensor, numerator: Tensor) -> Tensor:
+    """Residue at each pole of (b1 s + b0) / ((s - lambda)(s - conj lambda)).
+
+    Args:
+        poles: (*b, P). numerator: (*b, P, n, 2), b1 and b0 last, real.
+
+    Returns:
+        (*b, P, n), complex: B with B/(s - lambda) + conj = the section.
+    """
+    lam = poles.unsqueeze(-1)
+    b1, b0 = numerator[..., 0], numerator[..., 1]
+    real = 0.5 * b1
+    return torch.complex(real, -(0.5 * b0 + real * lam.real) / lam.imag)
+
+
+def numerators(poles: Tensor, residue: Tensor) -> Tensor:
+    """Inverse of `residues`: b1 and b0 (*b, P, n, 2)."""
+    b0 = -2.0 * (residue * poles.unsqueeze(-1).conj()).real
+    return torch.stack([2.0 * residue.real, b0], -1)
+
+
+def sample_horseshoe(
+    name: str, *shape: int, scale: float = HORSESHOE_SCALE, positive: bool = False
+) -> Tensor:
     """Horseshoe of the given scale over rows: scale * local * z (*b, *shape).
 
     Hierarchical and non-centred (Carvalho, Polson & Scott 2009): sites ``<name>.local_scale``
-    (shape[0],) half-Cauchy(1) and ``<name>.unit`` standard normal. Its density is proper, unlike
-    the horseshoe density itself, whose mode at zero is infinite.
+    (shape[0],) half-Cauchy(1) and ``<name>.unit`` standard normal, or half-normal if `positive`.
+    Its density is proper, unlike the horseshoe density itself, whose mode at zero is infinite.
     """
     one = torch.ones(shape[:1], dtype=torch.float64)
     local = pyro.sample(f"{name}.local_scale", dist.HalfCauchy(one).to_event(1))
-    unit = pyro.sample(f"{name}.unit", _normal(1.0, *shape))
+    ones = torch.ones(shape, dtype=torch.float64)
+    prior = dist.HalfNormal(ones) if positive else dist.Normal(0.0 * ones, ones)
+    unit = pyro.sample(f"{name}.unit", prior.to_event(len(shape)))
     return scale * local.reshape(local.shape + (1,) * (len(shape) - 1)) * unit
 
 
@@ -119,12 +155,14 @@ def sample_modes(
     Sites (all start with ``<name>.``), * marking what depends on the options:
 
     - ``log_decay``, ``log_frequency`` (P,): see `sample_poles`.
-    - ``input_gain`` (P, n_u, 2)*: Re and Im of B/|lambda| (output per input), normal(0, 3).
+    - ``input_gain`` (P, n_u, 2)*: g1 and g0 of each section (output per input), normal(0, 3).
     - ``output_gain`` (n_y, P, 2)*: direction of c, only for several outputs; normal(0, 1).
     - ``noise_gain.local_scale`` (P,), ``noise_gain.unit`` (P, n_l, 2)*: horseshoe of scale 0.1 on
-      L/sqrt(2 r), r the typical rate of the record: roughly the standard deviation of the output
-      of a pair that decays at that rate. Since the prior is on L itself (as the paper's), a pair
-      so fast that it would imitate measurement noise needs a large, unlikely L.
+      n1 and n0 of the noise's sections (n1 s + n0 |lambda|) sqrt(4 r) / (...), r the typical rate
+      of the record: the standard deviation of the output of a pair that decays at that rate. The
+      prior is on the intensity of the noise (as the paper's), so that a pair so fast that it would
+      imitate measurement noise needs a large, unlikely one. Where only the squares of n1 and n0
+      matter (one output; one pair, or independent noise; n_l = 1) they are positive.
     - ``feedthrough`` (n_y, n_u) or (n_u,)*: normal(0, 1).
 
     Args:
@@ -150,22 +188,28 @@ def sample_modes(
     B = L = D = None
     if inputs:
         gain = pyro.sample(f"{name}.input_gain", _normal(FLAT if flat else 3.0, pairs, inputs, 2))
-        B = _complex(gain) * poles.abs().unsqueeze(-1)
+        B = residues(poles, _section(poles, gain) * poles.abs()[..., None, None])
         if feedthrough:
             shape = (inputs,) if outputs is None else (outputs, inputs)
             D = pyro.sample(f"{name}.feedthrough", _normal(FLAT if flat else 1.0, *shape))
     if process_noise:
-        share = sample_horseshoe(f"{name}.noise_gain", pairs, brownian, 2)
-        L = _complex(share) * math.sqrt(2.0 * scale.typical_rate)
+        # The sign of a Brownian motion, and of a zero, cannot be seen in a covariance.
+        alone = outputs is None and brownian == 1 and (pairs == 1 or noise == "independent")
+        share = sample_horseshoe(f"{name}.noise_gain", pairs, brownian, 2, positive=alone)
+        L = residues(poles, _section(poles, share) * math.sqrt(4.0 * scale.typical_rate))
     if outputs is None:
         c = torch.ones(pairs, dtype=torch.complex128)
         c = c.expand(poles.shape)
     else:
         raw = _complex(pyro.sample(f"{name}.output_gain", _normal(1.0, outputs, pairs, 2)))
         c = unit_direction(raw)
-    return Modes(
-        poles=poles, input_gain=B, output_gain=c, noise_gain=L, feedthrough=D, noise=noise
-    )
+    return Modes(poles=poles, input_gain=B, output_gain=c, noise_gain=L, feedthrough=D, noise=noise)
+
+
+def _section(poles: Tensor, gain: Tensor) -> Tensor:
+    """(g1, g0) to the numerator (g1, g0 |lambda|)."""
+    size = poles.abs().unsqueeze(-1)
+    return torch.stack([gain[..., 0], gain[..., 1] * size], -1)
 
 
 def unit_direction(raw: Tensor) -> Tensor:

@@ -1,0 +1,1 @@
+"""Simulation, k-step prediction, forecast, and scores."""

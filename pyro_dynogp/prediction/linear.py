@@ -36,9 +36,7 @@ def prior_process(fit: Fit, record: Record, *, process_noise: bool = True) -> LT
             fit.model.prior_state(fit.system, modes),
             process_noise=process_noise,
         )
-    return fit.model.process(
-        fit.system, record, fit.scaling, state, process_noise=process_noise
-    )
+    return fit.model.process(fit.system, record, fit.scaling, state, process_noise=process_noise)
 
 
 def simulate(fit: Fit, record: Record, process_noise: bool, samples: int, seed: int) -> Prediction:

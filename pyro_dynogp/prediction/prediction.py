@@ -1,4 +1,4 @@
-"""What a prediction is: a Gaussian mixture at every time, with joint samples and a decomposition."""
+"""What a prediction is: a Gaussian mixture at every time, joint samples, shares of the variance."""
 
 from __future__ import annotations
 

@@ -98,7 +98,7 @@ def _crps(prediction: Prediction, there: np.ndarray, a: int, y: np.ndarray) -> f
     # The mixture's score is quadratic in the number of draws: blocks bound the memory.
     block = max(1, int(2e7 / len(mean) ** 2))
     parts = [
-        scoringrules.crps_mixnorm(y[i : i + block], mean[:, i : i + block].T, sd[:, i : i + block].T)
-        for i in range(0, len(y), block)
+        scoringrules.crps_mixnorm(y[k], mean[:, k].T, sd[:, k].T)
+        for k in (slice(i, i + block) for i in range(0, len(y), block))
     ]
     return float(np.mean(np.concatenate([np.atleast_1d(part) for part in parts])))

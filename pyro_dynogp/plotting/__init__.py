@@ -1,0 +1,20 @@
+"""Figures of records, predictions, identified systems and residuals.
+
+Every function returns a matplotlib Figure that belongs to nobody else: no pyplot, no global state,
+no display needed. Save it with ``figure.savefig("name.png")``; a notebook shows it as it is.
+"""
+
+from pyro_dynogp.plotting.diagnostics import history, residuals, starts
+from pyro_dynogp.plotting.signals import prediction, record
+from pyro_dynogp.plotting.systems import bode, impulse_response, pole_map
+
+__all__ = [
+    "bode",
+    "history",
+    "impulse_response",
+    "pole_map",
+    "prediction",
+    "record",
+    "residuals",
+    "starts",
+]
