@@ -96,12 +96,12 @@ class ConditionedLTIProcess(Trajectory):
         alpha = apply(self.K.solve, self.K, self.residual)
         update = apply(self.K.signal_matmul, self.K, alpha)
         shape = self.batch_shape + self.event_shape
-        return self.prior.mean.expand(shape) + self.to_event(update).expand(shape)
+        return self.prior.mean.expand(shape) + self.from_rows(update).expand(shape)
 
     @property
     def variance(self) -> Tensor:
         """Var[h_k | y] (*batch, *event)."""
-        return self.to_event(self.K.signal_variance()).expand(self.batch_shape + self.event_shape)
+        return self.from_rows(self.K.signal_variance()).expand(self.batch_shape + self.event_shape)
 
     def rsample(self, sample_shape: Any = ()) -> Tensor:
         """Joint draws of the trajectory given y, by Matheron's rule."""
@@ -115,7 +115,7 @@ class ConditionedLTIProcess(Trajectory):
         K = self._jittered
         alpha = apply(K.solve, K, departure)
         update = apply(K.signal_matmul, K, alpha) + self.prior.noise_rows * alpha
-        return h + self.to_event(update)
+        return h + self.from_rows(update)
 
     def log_prob(self, value: Any) -> Tensor:
         """Joint log-density of trajectories: log p(h) + log p(y | h) - log p(y)."""

@@ -116,7 +116,7 @@ class LTIProcess(Trajectory):
         """(*batch, *event): of each sample by itself, without jitter."""
         unseen = torch.full((self._size,), math.inf, dtype=torch.float64)
         p = self.covariance(unseen.to(self.modes.poles.device)).signal_variance_given_past
-        return self.to_event(p).expand(self.batch_shape + self.event_shape)
+        return self.from_rows(p).expand(self.batch_shape + self.event_shape)
 
     def covariance(self, noise_variance: Tensor) -> SemiseparableCovariance:
         """Covariance of the trajectory plus independent noise of the given variance (*b, N)."""

@@ -86,12 +86,12 @@ class Trajectory(TorchDistribution):
 
     def from_innovations(self, noise: Tensor) -> Tensor:
         """Trajectory m + L D^{1/2} e of standard normal innovations e (..., *event)."""
-        return self.mean + self.to_event(apply(self.root.root_matmul, self.root, self.rows(noise)))
+        return self.mean + self.from_rows(apply(self.root.root_matmul, self.root, self.rows(noise)))
 
     def to_innovations(self, value: Tensor) -> Tensor:
         """Standardised innovations D^{-1/2} L^{-1} (y - m) of a trajectory y (..., *event)."""
         residual = self.rows(value - self.mean)
-        return self.to_event(apply(self.root.root_solve, self.root, residual))
+        return self.from_rows(apply(self.root.root_solve, self.root, residual))
 
     def log_prob(self, value: Any) -> Tensor:
         """Joint log-density (*s, *batch) of trajectories (*s, *batch, *event)."""
@@ -112,7 +112,7 @@ class Trajectory(TorchDistribution):
         """(..., *event) to (..., N)."""
         return x.flatten(-2) if self.modes.several_outputs else x
 
-    def to_event(self, x: Tensor) -> Tensor:
+    def from_rows(self, x: Tensor) -> Tensor:
         """(..., N) to (..., *event)."""
         return x.reshape(x.shape[:-1] + self.event_shape)
 

@@ -69,9 +69,10 @@ def _given_poles(
     rate = np.abs(poles)
     gains = weights[:, : 2 * P * n_u].reshape(n_y, P, n_u, 2)
     residues = (gains[..., 0] + 1j * gains[..., 1]) * rate[:, None]  # c_aj B_jm
+    unit_rate = TimeScale(float(scaling.time_step), float(scaling.duration)).typical_rate
     values: dict[str, Any] = {
-        "g.log_decay": np.log(-poles.real),
-        "g.log_frequency": np.log(poles.imag),
+        "g.log_decay": np.log(-poles.real / unit_rate),
+        "g.log_frequency": np.log(poles.imag / unit_rate),
         "offset": weights[:, -1],
         "noise_sd": 0.7 * spread + 1e-3,
     }
@@ -114,7 +115,8 @@ def _design(poles: np.ndarray, time: np.ndarray, u: np.ndarray, feedthrough: boo
     grid = time_grid(time)
     columns = []
     if n_u:
-        modes = Modes(poles, np.ones((len(poles), 1)), np.ones(len(poles)))
+        one = torch.ones(len(poles), dtype=torch.complex128)
+        modes = Modes(torch.as_tensor(poles), one.unsqueeze(-1), one)
         states = np.stack(
             [held_states(modes, grid, u[:, m : m + 1]) for m in range(n_u)], -1
         )  # n, P, n_u

@@ -84,7 +84,7 @@ class _Lower(_Recursion):
         return Z
 
     @staticmethod
-    def backward(ctx: Any, Z_bar: Tensor) -> Any:  # type: ignore[override]
+    def backward(ctx: Any, Z_bar: Tensor) -> Any:
         re, im, h, w, X, Z = (array(a) for a in ctx.saved_tensors)
         step, out, solve, transpose = ctx.index
         kernel = recursions.lower if transpose else recursions.upper
@@ -107,7 +107,7 @@ class _LaterInformation(_Recursion):
         return _Recursion.tensors(args[0], kappa)[0]
 
     @staticmethod
-    def backward(ctx: Any, kappa_bar: Tensor) -> Any:  # type: ignore[override]
+    def backward(ctx: Any, kappa_bar: Tensor) -> Any:
         re, im, h, e, d = (array(a) for a in ctx.saved_tensors)
         step, out = ctx.index
         grads = recursions.later_information_adjoint(re, im, step, out, h, e, d, array(kappa_bar))

@@ -125,7 +125,7 @@ class LinearDynamicGP:
                         advice=f"Choose channels with record.select(...) or set {what}={got}.",
                     )
             if self.scaling is not None:
-                self.scaling.check(record)
+                self.scaling.check(record, outputs=record.n_outputs > 0)
         return checked
 
     @property

@@ -74,28 +74,29 @@ def sample_poles(name: str, pairs: int, time_scale: TimeScale, priors: PriorName
     """Sample P poles (*b, P) [1/s].
 
     Sites: ``<name>.log_decay`` and ``<name>.log_frequency`` (P,), logarithms of -Re lambda and of
-    Im lambda [1/s]. Default: uniform between the rates 1/duration and pi/step (for frequencies
+    Im lambda over the typical rate of the record. Default: uniform between the rates 1/duration and pi/step (for frequencies
     from a tenth of the slowest rate, which is as good as a real pole). Paper: flat.
     """
     low, high = time_scale.rate_bounds
     if high <= low:
         raise invalid("time_scale", expected="more than three samples", got=repr(time_scale))
     if priors == "paper":
-        centre = torch.full((pairs,), 0.5 * (low + high), dtype=torch.float64)
-        flat = dist.Normal(centre, torch.full_like(centre, FLAT)).to_event(1)
+        flat = _normal(FLAT, pairs)
         log_decay = pyro.sample(f"{name}.log_decay", flat)
         log_frequency = pyro.sample(f"{name}.log_frequency", flat)
     else:
-        top = torch.full((pairs,), high, dtype=torch.float64)
+        half = 0.5 * (high - low)
+        top = torch.full((pairs,), half, dtype=torch.float64)
 
         def uniform(bottom: float) -> dist.Distribution:
             return dist.Uniform(torch.full_like(top, bottom), top).to_event(1)
 
-        log_decay = pyro.sample(f"{name}.log_decay", uniform(low))
-        log_frequency = pyro.sample(f"{name}.log_frequency", uniform(low - math.log(10.0)))
-    decay = log_decay.exp()
+        log_decay = pyro.sample(f"{name}.log_decay", uniform(-half))
+        log_frequency = pyro.sample(f"{name}.log_frequency", uniform(-half - math.log(10.0)))
+    decay = time_scale.typical_rate * log_decay.exp()
+    undamped = time_scale.typical_rate * log_frequency.exp()
     # The floor is as good as a double real pole (relative error 4e-4) and keeps residues bounded.
-    frequency = (log_frequency.exp().square() + (CRITICAL * decay).square()).sqrt()
+    frequency = (undamped.square() + (CRITICAL * decay).square()).sqrt()
     return torch.complex(-decay, frequency)
 
 

@@ -6,12 +6,14 @@ no display needed. Save it with ``figure.savefig("name.png")``; a notebook shows
 
 from pyro_dynogp.plotting.diagnostics import history, residuals, starts
 from pyro_dynogp.plotting.signals import prediction, record
+from pyro_dynogp.plotting.style import named
 from pyro_dynogp.plotting.systems import bode, impulse_response, pole_map
 
 __all__ = [
     "bode",
     "history",
     "impulse_response",
+    "named",
     "pole_map",
     "prediction",
     "record",

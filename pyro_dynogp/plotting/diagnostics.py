@@ -83,7 +83,9 @@ def _histogram(axes: Axes, e: np.ndarray) -> None:
     edges = np.histogram_bin_edges(seen, bins="fd")
     if not 12 <= len(edges) <= 60:  # outliers stretch, few samples coarsen the automatic bins
         edges = np.linspace(seen.min(), seen.max(), int(np.clip(len(edges), 12, 60)))
-    axes.hist(seen, bins=edges, density=True, color="#BFBFBF", edgecolor="white", label="errors")
+    axes.hist(
+        seen, bins=edges.tolist(), density=True, color="#BFBFBF", edgecolor="white", label="errors"
+    )
     reach = max(3.5, float(np.abs(seen).max()))
     grid = np.linspace(-reach, reach, 300)
     density = np.exp(-0.5 * grid**2) / np.sqrt(2.0 * np.pi)

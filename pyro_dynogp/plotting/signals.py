@@ -35,7 +35,7 @@ def record(record: Record) -> Figure:
     x = clock.positions(record.time)
     for a, name in enumerate(record.output_names):
         panel = axes[a, 0]
-        style.draw_measured(panel, x, record.outputs[:, a], "output", style.MODEL)
+        style.draw_measured(panel, x, record.outputs[:, a], "output", style.MEASURED)
         missing = x[record.missing[:, a]]
         if len(missing):
             panel.plot(
@@ -126,8 +126,10 @@ def prediction(
         below.axhline(0.0, color=style.MODEL, linewidth=1.0)
         style.draw_measured(below, x, measured - mean, "measured", style.MEASURED)
         style.label(below, y=style.named("residual", unit))
-        for one in (panel, below):
-            _shade_skipped(one, x, skip)
+        for one, shift in ((panel, np.zeros_like(mean)), (below, mean)):
+            if skip:
+                drawn = np.stack([low[:, a] - shift, high[:, a] - shift, measured - shift])
+                _leave_out(one, x, drawn, skip)
     axes[0, 0].margins(x=0.01)
     clock.decorate(axes[-1, 0])
     figure.align_ylabels()
@@ -136,12 +138,15 @@ def prediction(
     return figure
 
 
-def _shade_skipped(axes: Axes, x: np.ndarray, skip: int) -> None:
-    if skip:
-        # Up to the middle between the last sample left out and the first that counts.
-        axes.axvspan(
-            x[0], 0.5 * (x[skip - 1] + x[skip]), color="#E9E4D4", zorder=0, label="not scored"
-        )
+def _leave_out(axes: Axes, x: np.ndarray, drawn: np.ndarray, skip: int) -> None:
+    """Shade the samples that are not scored; their bands, often very wide, set no limits."""
+    # Up to the middle between the last sample left out and the first that counts.
+    axes.axvspan(x[0], 0.5 * (x[skip - 1] + x[skip]), color="#E9E4D4", zorder=0, label="not scored")
+    low, high = np.nanmin(drawn[:, skip:]), np.nanmax(drawn[:, skip:])
+    first = drawn[2, :skip][np.isfinite(drawn[2, :skip])]
+    low, high = min(low, *first, low), max(high, *first, high)
+    margin = 0.06 * (high - low)
+    axes.set_ylim(low - margin, high + margin)
 
 
 def _check(prediction: Prediction, record: Record | None, skip: int, past: Record | None) -> None:

@@ -10,6 +10,7 @@ import matplotlib.dates as mdates
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 if TYPE_CHECKING:
     from pyro_dynogp.record import Record
@@ -22,8 +23,8 @@ ACCENT = "#CC79A7"
 MUTED = "#8A8A8A"
 PALETTE = (MODEL, INPUT, "#009E73", ACCENT, "#E69F00", "#56B4E9")
 TITLE_SIZE, LABEL_SIZE, TICK_SIZE = 12, 10.5, 9.5
-BAND_95 = {"color": MODEL, "alpha": 0.17, "linewidth": 0}
-BAND_50 = {"color": MODEL, "alpha": 0.36, "linewidth": 0}
+BAND_95: dict[str, Any] = {"color": MODEL, "alpha": 0.17, "linewidth": 0}
+BAND_50: dict[str, Any] = {"color": MODEL, "alpha": 0.36, "linewidth": 0}
 
 
 class ShownFigure(Figure):
@@ -42,11 +43,11 @@ def panels(
     width: float = 9.0,
     height: float = 5.0,
     ratios: Sequence[float] | None = None,
-    share_x: bool | str = False,
+    share_x: bool = False,
 ) -> tuple[Figure, np.ndarray]:
     """Make a figure with a grid of plain axes (rows, columns)."""
-    figure = ShownFigure(figsize=(width, height), dpi=110, layout="constrained")
-    figure.set_facecolor("white")
+    layout = ConstrainedLayoutEngine(w_pad=0.09, h_pad=0.07)
+    figure = ShownFigure(figsize=(width, height), dpi=110, layout=layout, facecolor="white")
     axes = figure.subplots(
         rows, columns, squeeze=False, sharex=share_x, gridspec_kw={"height_ratios": ratios}
     )

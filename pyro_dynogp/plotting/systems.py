@@ -171,9 +171,9 @@ def pole_map(fit: Fit) -> Figure:
             draws.imag,
             linestyle="none",
             marker=".",
-            markersize=4,
+            markersize=5,
             markeredgewidth=0,
-            alpha=max(0.12, min(0.6, 250.0 / len(draws))),
+            alpha=max(0.15, min(0.6, 350.0 / len(draws))),
             color=style.MODEL,
             label="posterior draws",
         )
@@ -213,17 +213,14 @@ def _damping_lines(axes: Axes, left: float, top: float) -> None:
             zorder=0,
             label=None if index else "constant damping ratio",
         )
-        upper = top / slope <= left
         axes.annotate(
             f"{ratio:g}",
-            (-end, slope * end),
-            xytext=(0, 3) if upper else (-3, 0),
-            textcoords="offset points",
-            ha="center" if upper else "right",
-            va="bottom" if upper else "center",
-            fontsize=style.TICK_SIZE,
+            (-0.93 * end, 0.93 * slope * end),
+            ha="center",
+            va="center",
+            fontsize=style.TICK_SIZE - 0.5,
             color="#777777",
-            annotation_clip=False,
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.2},
         )
 
 

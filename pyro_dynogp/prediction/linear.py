@@ -99,8 +99,8 @@ def predict(fit: Fit, record: Record, horizon: int, samples: int, seed: int) -> 
         v = observed.noise_rows
         v = v if missing is None else v.masked_fill(missing, torch.inf)
         moments = predict_k_steps(process.covariance(v), residual, horizon)
-        mean = process.mean + process.to_event(moments.mean)
-        variance = process.to_event(moments.variance)
+        mean = process.mean + process.from_rows(moments.mean)
+        variance = process.from_rows(moments.variance)
     mean_, variance_ = _outputs(fit, mean), _outputs(fit, variance)
     noise = _noise(fit)
     parts = {

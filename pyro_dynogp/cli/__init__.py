@@ -1,0 +1,285 @@
+"""Command line: pyro-dynogp demo, info, fit, simulate.
+
+Torch and Pyro are imported inside the commands, so that ``--help`` need not wait for them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from pyro_dynogp.cli.data import InvalidInput, record_for, training_and_test
+
+
+class _Group(click.Group):
+    """Turns the package's own complaints about input into one line; all else keeps its trace."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except ValueError as error:
+            if not _from_package(error):
+                raise
+            raise InvalidInput(" ".join(str(error).split())) from error
+        except OSError as error:
+            if error.filename is None:
+                raise
+            raise InvalidInput(f"{error.filename}: {error.strerror}.") from error
+
+
+def _from_package(error: BaseException) -> bool:
+    """Whether the error was raised by this package, not by a library that it called."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    module = "" if trace is None else str(trace.tb_frame.f_globals.get("__name__", ""))
+    return module == "pyro_dynogp" or module.startswith("pyro_dynogp.")
+
+
+def _options(*decorators: Any) -> Any:
+    def apply(command: Any) -> Any:
+        for decorator in reversed(decorators):
+            command = decorator(command)
+        return command
+
+    return apply
+
+
+_CLOCK = _options(
+    click.option("--time", metavar="COLUMN", help="Column of times: numbers or ISO 8601 stamps."),
+    click.option(
+        "--sampling-time",
+        type=click.FloatRange(min=0, min_open=True),
+        metavar="S",
+        help="Step between samples, where there is no column of times.",
+    ),
+    click.option("--timezone", metavar="TZ", help="Zone of the stamps, such as Europe/Vienna."),
+    click.option("--time-unit", metavar="UNIT", help="Unit of numeric times; s if not given."),
+)
+_PLAIN = {"context_settings": {"help_option_names": ["-h", "--help"], "max_content_width": 100}}
+
+
+@click.group(cls=_Group, name="pyro-dynogp", **_PLAIN)
+@click.version_option(package_name="pyro-dynogp")
+def main() -> None:
+    """Bayesian identification of dynamic systems from measured inputs and outputs.
+
+    \b
+    Examples:
+      pyro-dynogp demo
+      pyro-dynogp info plant.csv
+      pyro-dynogp fit plant.csv --input valve --output level --sampling-time 0.5 \\
+          --train 800 --save plant.safetensors --figures figures
+      pyro-dynogp simulate plant.safetensors next_week.csv --sampling-time 0.5 --out level.csv
+
+    Exit codes: 0 done, 1 unexpected error, 2 input that has to be put right.
+    """  # noqa: D301 (\b is click's mark of a paragraph that keeps its lines)
+
+
+@main.command()
+@click.option(
+    "--output",
+    "directory",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=Path("demo_output"),
+    show_default=True,
+    help="Folder for the figures, the scores and the fitted model; made where it is missing.",
+)
+@click.option("--quiet", is_flag=True, help="No progress bars.")
+def demo(directory: Path, quiet: bool) -> None:
+    """Identify the coupled electric drives, a record that ships with the package.
+
+    \b
+    Examples:
+      pyro-dynogp demo
+      pyro-dynogp demo --output /tmp/drives
+    """  # noqa: D301
+    from pyro_dynogp.demo import run_demo
+
+    run_demo(directory, progress=not quiet)
+
+
+@main.command()
+@click.argument("subject", metavar="[DATASET_OR_FILE]", required=False)
+def info(subject: str | None) -> None:
+    """Tell versions and shipped data sets, or about one data set, CSV file or saved fit.
+
+    \b
+    Examples:
+      pyro-dynogp info
+      pyro-dynogp info gas_furnace
+      pyro-dynogp info plant.csv
+      pyro-dynogp info plant.safetensors
+    """  # noqa: D301
+    from pyro_dynogp.cli.describe import tell
+
+    tell(subject)
+
+
+@main.command()
+@click.argument("data")
+@click.option("--input", "inputs", multiple=True, metavar="NAME", help="Input column; repeatable.")
+@click.option(
+    "--output", "outputs", multiple=True, metavar="NAME", help="Output column; repeatable."
+)
+@_CLOCK
+@click.option(
+    "--unit",
+    "units",
+    multiple=True,
+    metavar="NAME=UNIT",
+    help="Unit of a column, for labels and checks; repeatable.",
+)
+@click.option(
+    "--train", type=click.IntRange(min=2), metavar="N", help="Train on the first N samples alone."
+)
+@click.option(
+    "--pairs", type=click.IntRange(min=1), default=5, show_default=True,
+    help="Number of pole pairs (half the order).",
+)  # fmt: skip
+@click.option(
+    "--method", type=click.Choice(["map", "svi", "nuts"]), default="map", show_default=True,
+    help="Posterior mode; variational posterior; Hamiltonian Monte Carlo.",
+)  # fmt: skip
+@click.option(
+    "--starts", type=click.IntRange(min=1), default=6, show_default=True,
+    help="Number of points from which the optimum is sought.",
+)  # fmt: skip
+@click.option("--steps", type=click.IntRange(min=1), metavar="N", help="Most iterations.")
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True,
+    help="The same seed gives the same fit.",
+)  # fmt: skip
+@click.option(
+    "--save", type=click.Path(dir_okay=False, path_type=Path), metavar="FILE",
+    help="Write the fit here (.safetensors).",
+)  # fmt: skip
+@click.option(
+    "--figures", type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
+    help="Write figures into this folder; made where it is missing.",
+)  # fmt: skip
+@click.option(
+    "--workers",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Processes; all processors if not given.",
+)
+@click.option("--quiet", is_flag=True, help="No progress bars.")
+def fit(
+    data: str,
+    inputs: tuple[str, ...],
+    outputs: tuple[str, ...],
+    units: tuple[str, ...],
+    train: int | None,
+    pairs: int,
+    method: Any,
+    starts: int,
+    steps: int | None,
+    seed: int,
+    save: Path | None,
+    figures: Path | None,
+    workers: int | None,
+    quiet: bool,
+    **clock: Any,
+) -> None:
+    """Fit a linear dynamic Gaussian process to DATA, a CSV file or the name of a data set.
+
+    Prints the fit, and the scores of predictions of the samples that training left out (those
+    after --train; a data set has its own test samples).
+
+    \b
+    Examples:
+      pyro-dynogp fit plant.csv --input valve --input pump --output level \\
+          --time stamp --timezone Europe/Vienna --train 800 --save plant.safetensors
+      pyro-dynogp fit gas_furnace --pairs 3 --method svi --figures figures
+    """  # noqa: D301
+    import pyro_dynogp as dgp
+    from pyro_dynogp import demo as report
+
+    # What cannot be written is told before the fit, not after it.
+    if save is not None and not save.absolute().parent.is_dir():
+        raise InvalidInput(f"--save: there is no folder {save.absolute().parent}.")
+    if figures is not None:
+        figures.mkdir(parents=True, exist_ok=True)
+    parts = training_and_test(data, inputs, outputs, units, clock, train)
+    first, test = parts.train[0], parts.test
+    model = dgp.LinearDynamicGP(inputs=first.n_inputs, outputs=first.n_outputs, pairs=pairs)
+    fitted = dgp.fit(
+        model,
+        first if len(parts.train) == 1 else parts.train,
+        method=method,
+        seed=seed,
+        starts=starts,
+        steps=steps,
+        workers=workers,
+        progress=not quiet,
+    )
+    click.echo(fitted.summary())
+    if save is not None:
+        fitted.save(save)
+        click.echo(f"saved to {save}")
+    results = None
+    if test is not None:
+        past = first if parts.follows else None
+        results = report.evaluate(fitted, test, past=past, skip=parts.skip)
+        left_out = f" (the first {parts.skip} are not counted)" if parts.skip else ""
+        click.echo(f"\nScores on {len(test)} samples{left_out}:")
+        click.echo(report.score_table(results, test))
+    if figures is not None:
+        written = report.write_figures(
+            fitted, figures, train=first, test=test, results=results, skip=parts.skip
+        )
+        click.echo(f"{len(written)} figures in {figures}")
+
+
+@main.command()
+@click.argument("model", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.argument("data")
+@_CLOCK
+@click.option(
+    "--out", required=True, type=click.Path(dir_okay=False, path_type=Path), metavar="CSV",
+    help="Write mean, standard deviation and 95 % interval here; - for standard output.",
+)  # fmt: skip
+@click.option("--no-process-noise", is_flag=True, help="Simulate the deterministic system.")
+@click.option(
+    "--horizon", type=click.IntRange(min=1), metavar="K",
+    help="Predict K samples ahead from measured outputs instead.",
+)  # fmt: skip
+def simulate(
+    model: Path, data: str, out: Path, no_process_noise: bool, horizon: int | None, **clock: Any
+) -> None:
+    """Simulate the outputs of a saved MODEL from the inputs in DATA.
+
+    DATA is a CSV file with the columns of the training record, taken to be in the same units, or
+    the name of a data set (its test record). Outputs are read where there are any, and used with
+    --horizon alone.
+
+    \b
+    Examples:
+      pyro-dynogp simulate plant.safetensors next_week.csv --sampling-time 0.5 --out level.csv
+      pyro-dynogp simulate plant.safetensors next_week.csv --sampling-time 0.5 --horizon 10 --out -
+    """  # noqa: D301
+    if horizon is not None and no_process_noise:
+        raise InvalidInput("--no-process-noise: for simulations; leave it out with --horizon.")
+    from pyro_dynogp import load
+
+    fitted = load(model)
+    record, has_outputs = record_for(fitted, data, clock)
+    if horizon is None:
+        prediction = fitted.simulate(record, process_noise=not no_process_noise)
+    elif has_outputs:
+        prediction = fitted.predict(record, horizon=horizon)
+    else:
+        raise InvalidInput(
+            f"--horizon: needs the measured outputs {list(fitted.scaling.output_names)} in {data}."
+        )
+    frame = prediction.to_frame()
+    if record.timestamps is not None:
+        frame.index = record.timestamps.map(lambda stamp: stamp.isoformat()).rename("time")
+    if str(out) == "-":
+        click.echo(frame.to_csv(), nl=False)
+    else:
+        frame.to_csv(out)
+        click.echo(f"{len(frame)} rows in {out}")
