@@ -129,7 +129,7 @@ def run_demo(
     *,
     pairs: int = 5,
     starts: int = 4,
-    steps: int = 800,
+    steps: int = 600,
     workers: int | None = None,
 ) -> dict[str, Any]:
     """Identify the coupled drives by variational inference; write the model, scores and figures.

@@ -38,6 +38,13 @@ def _from_package(error: BaseException) -> bool:
     return module == "pyro_dynogp" or module.startswith("pyro_dynogp.")
 
 
+def _check_folder(option: str, path: Path) -> None:
+    """Tell what cannot be written before the work, not after it."""
+    folder = path.absolute().parent
+    if not folder.is_dir():
+        raise InvalidInput(f"{option}: there is no folder {folder}.")
+
+
 def _options(*decorators: Any) -> Any:
     def apply(command: Any) -> Any:
         for decorator in reversed(decorators):
@@ -56,7 +63,11 @@ _CLOCK = _options(
         help="Step between samples, where there is no column of times.",
     ),
     click.option("--timezone", metavar="TZ", help="Zone of the stamps, such as Europe/Vienna."),
-    click.option("--time-unit", metavar="UNIT", help="Unit of numeric times; s if not given."),
+    click.option(
+        "--time-unit",
+        metavar="UNIT",
+        help="Unit of numeric times [s, or the model's].",
+    ),
 )
 _PLAIN = {"context_settings": {"help_option_names": ["-h", "--help"], "max_content_width": 100}}
 
@@ -94,7 +105,7 @@ def demo(directory: Path, quiet: bool) -> None:
     \b
     Examples:
       pyro-dynogp demo
-      pyro-dynogp demo --output /tmp/drives
+      pyro-dynogp demo --output drives
     """  # noqa: D301
     from pyro_dynogp.demo import run_demo
 
@@ -198,9 +209,8 @@ def fit(
     import pyro_dynogp as dgp
     from pyro_dynogp import demo as report
 
-    # What cannot be written is told before the fit, not after it.
-    if save is not None and not save.absolute().parent.is_dir():
-        raise InvalidInput(f"--save: there is no folder {save.absolute().parent}.")
+    if save is not None:
+        _check_folder("--save", save)
     if figures is not None:
         figures.mkdir(parents=True, exist_ok=True)
     parts = training_and_test(data, inputs, outputs, units, clock, train)
@@ -263,6 +273,7 @@ def simulate(
     """  # noqa: D301
     if horizon is not None and no_process_noise:
         raise InvalidInput("--no-process-noise: for simulations; leave it out with --horizon.")
+    _check_folder("--out", out)
     from pyro_dynogp import load
 
     fitted = load(model)

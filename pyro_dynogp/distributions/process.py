@@ -15,7 +15,7 @@ from pyro.distributions import constraints
 from torch import Tensor
 
 from pyro_dynogp._errors import invalid
-from pyro_dynogp._tensors import as_tensor
+from pyro_dynogp._tensors import as_tensor, broadcast
 from pyro_dynogp.distributions.trajectory import Trajectory, real_or_missing
 from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.lti.modes import Modes
@@ -83,7 +83,7 @@ class LTIProcess(Trajectory):
             self.offset = b.unsqueeze(-2) if modes.several_outputs else b.unsqueeze(-1)
             shapes.append(b.shape[: b.dim() - modes.several_outputs])
         self._response: Response | None = None
-        self._shape(torch.broadcast_shapes(*shapes), len(self.grid), validate_args)
+        self._shape(broadcast(*shapes), len(self.grid), validate_args)
 
     @property
     def support(self) -> constraints.Constraint:
@@ -198,7 +198,7 @@ class ObservedLTIProcess(Trajectory):
             v = v.unsqueeze(-2) if several else v.unsqueeze(-1)
             v = v.expand((*batch, n, *constant))
         self.noise_variance = v
-        self._shape(torch.broadcast_shapes(process.batch_shape, batch), n, validate_args)
+        self._shape(broadcast(process.batch_shape, batch), n, validate_args)
 
     @property
     def support(self) -> constraints.Constraint:

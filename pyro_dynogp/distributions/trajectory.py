@@ -11,7 +11,7 @@ from pyro.distributions import TorchDistribution, constraints
 from torch import Tensor
 
 from pyro_dynogp._errors import invalid
-from pyro_dynogp._tensors import as_tensor
+from pyro_dynogp._tensors import as_tensor, broadcast
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.semiseparable import SemiseparableCovariance
 
@@ -61,7 +61,7 @@ class Trajectory(TorchDistribution):
     def expand(self, batch_shape: Any, _instance: Any = None) -> Any:
         """Broadcast to a larger batch shape; nothing is copied."""
         shape = torch.Size(batch_shape)
-        if torch.broadcast_shapes(shape, self.batch_shape) != shape:
+        if broadcast(shape, self.batch_shape) != shape:
             raise invalid(
                 "batch_shape",
                 expected=f"a shape that {tuple(self.batch_shape)} broadcasts to",

@@ -166,15 +166,18 @@ class Fit:
         save(self, path)
 
     def summary(self) -> str:
-        """A few lines: what was fitted, how well it went, the modes."""
+        """A few lines: what was fitted, how well it went, the modes at the best optimum."""
         lines = [
-            f"{type(self.model).__name__}: {self.model.pairs} pairs, {self.model.inputs} inputs, "
-            f"{self.model.outputs} outputs; method {self.method}, seed {self.seed}",
+            f"{type(self.model).__name__} with pairs={self.model.pairs}, "
+            f"inputs={self.model.inputs}, outputs={self.model.outputs}; "
+            f"method {self.method!r}, seed {self.seed}",
             "-log p(y, values) of the starts: "
             + ", ".join(f"{e:.1f}" for e in self.start_energies[:6]),
         ]
-        modes = self.system.modes
-        frequency, damping = modes.natural_frequency.mean(0), modes.damping.mean(0)
+        condition = pyro.poutine.condition(self.model.sample_system, data=dict(self.mode))
+        with torch.no_grad(), pyro.poutine.block():
+            modes = condition(self.scaling).modes
+        frequency, damping = modes.natural_frequency, modes.damping
         for j in torch.argsort(frequency).tolist():
             lines.append(
                 f"  natural frequency {float(frequency[j]):10.4g} rad/{self.scaling.time_unit}"

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pyro
 import torch
+from scipy.optimize import minimize
 from torch import Tensor
 from torch.distributions import biject_to
 from torch.distributions.transforms import Transform
@@ -60,33 +61,32 @@ class Potential:
 
     def unpack(self, z: Tensor) -> dict[str, Tensor]:
         """Unconstrained vectors (*s, d) to constrained values (*s, *shape) of every site."""
-        values, start = {}, 0
+        return {site.name: site.transform(part) for site, part in self._parts(z)}
+
+    def _parts(self, z: Tensor) -> Iterator[tuple[Site, Tensor]]:
+        start = 0
         for site in self.sites:
             stop = start + site.unconstrained.numel()
-            part = z[..., start:stop].reshape(z.shape[:-1] + site.unconstrained)
-            values[site.name] = site.transform(part)
+            yield site, z[..., start:stop].reshape(z.shape[:-1] + site.unconstrained)
             start = stop
-        return values
 
     def log_joint(self, values: Mapping[str, Tensor]) -> Tensor:
         """Log p(y, values), of constrained values."""
         conditioned = pyro.poutine.condition(self.model, data=dict(values))
         return pyro.poutine.trace(conditioned).get_trace(*self.args).log_prob_sum()
 
-    def log_jacobian(self, z: Tensor) -> Tensor:
-        """Log-determinant of the map from the unconstrained vector z (d,) to the values."""
-        total, start = z.new_zeros(()), 0
-        for site in self.sites:
-            stop = start + site.unconstrained.numel()
-            part = z[start:stop].reshape(site.unconstrained)
-            total = total + site.transform.log_abs_det_jacobian(part, site.transform(part)).sum()
-            start = stop
-        return total
-
     def energy(self, z: Tensor, *, jacobian: bool) -> Tensor:
         """-log density at z (d,): of the values, or with `jacobian` of the unconstrained vector."""
-        energy = -self.log_joint(self.unpack(z))
-        return energy - self.log_jacobian(z) if jacobian else energy
+        values: dict[str, Tensor] = {}
+        log_jacobian: Tensor | float = 0.0
+        for site, part in self._parts(z):
+            value = site.transform(part)
+            values[site.name] = value
+            if jacobian:
+                log_jacobian = (
+                    log_jacobian + site.transform.log_abs_det_jacobian(part, value).sum()
+                )
+        return -self.log_joint(values) - log_jacobian
 
     def value_and_gradient(
         self, z: np.ndarray, *, jacobian: bool = False
@@ -121,10 +121,28 @@ class Potential:
         return 0.5 * (H + H.T)
 
 
+    def laplace(
+        self, values: Mapping[str, Tensor], *, widest: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Centre (d,) and root (d, d) of the Laplace approximation of the unconstrained vector.
+
+        The centre is the mode of that vector's own density (with Jacobian), climbed to from
+        `values`: the mode of the constrained density can lie on a boundary, at minus infinity.
+        """
+        result = minimize(
+            lambda z: self.value_and_gradient(z, jacobian=True),
+            self.pack(values).numpy(),
+            jac=True,
+            method="L-BFGS-B",
+            options={"maxiter": 300, "ftol": 1e-9},
+        )
+        return result.x, laplace_root(self.hessian(result.x), widest=widest)
+
+
 _WALL = 1e15
 
 
-def laplace_root(hessian: np.ndarray, *, widest: float = 10.0) -> np.ndarray:
+def laplace_root(hessian: np.ndarray, *, widest: float) -> np.ndarray:
     """Lower Cholesky factor of the inverse Hessian.
 
     Directions in which the density is flat or curves upwards get the standard deviation `widest`

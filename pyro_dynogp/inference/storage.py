@@ -13,6 +13,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
+from pyro_dynogp._errors import invalid
 from pyro_dynogp.inference.guides import GaussianGuide
 from pyro_dynogp.inference.potential import Potential
 from pyro_dynogp.models.linear import LinearDynamicGP
@@ -28,7 +29,11 @@ MODELS = {"LinearDynamicGP": LinearDynamicGP}
 
 
 def save(fit: Fit, path: str | Path) -> None:
-    """Write a fit to a file; `load` restores every number to the last bit."""
+    """Write a fit to a file; `load` restores every number to the last bit.
+
+    Raises:
+        ValueError: where the folder does not exist.
+    """
     tensors = {f"draws/{name}": value.contiguous() for name, value in fit.draws.items()}
     tensors |= {f"mode/{name}": value.contiguous() for name, value in fit.mode.items()}
     tensors["history"] = torch.as_tensor(np.ascontiguousarray(fit.history))
@@ -53,6 +58,11 @@ def save(fit: Fit, path: str | Path) -> None:
         "diagnostics": dict(fit.diagnostics),
         "sites": list(fit.draws),
     }
+    folder = Path(path).resolve().parent
+    if not folder.is_dir():
+        raise invalid(
+            "path", expected="a file in an existing folder", got=str(path), advice="Make it first."
+        )
     clones = {name: value.clone() for name, value in tensors.items()}
     save_file(clones, str(path), metadata={FORMAT: json.dumps(header)})
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from pyro_dynogp.inference.guides import GaussianGuide, gaussian_guide
-from pyro_dynogp.inference.potential import Potential, laplace_root
+from pyro_dynogp.inference.potential import Potential
 
 
 class PreconditionedNormal(AutoMultivariateNormal):
@@ -70,9 +70,9 @@ def variational(
     parameters live in a scope of the parameter store of their own.
     """
     potential = Potential(model, args, values)
-    z = potential.pack(values)
-    root = torch.as_tensor(laplace_root(potential.hessian(z.numpy())))
-    guide = PreconditionedNormal(model, z, root, init_loc_fn=init_to_value(values=values))
+    centre, root = (torch.as_tensor(x) for x in potential.laplace(values, widest=2.0))
+    start = {name: value.detach() for name, value in potential.unpack(centre).items()}
+    guide = PreconditionedNormal(model, centre, root, init_loc_fn=init_to_value(values=start))
     order = [site.name for site in potential.sites]
     elbo: list[float] = []
     message = "all steps used"

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp._errors import invalid
-from pyro_dynogp._tensors import as_tensor
+from pyro_dynogp._tensors import as_tensor, broadcast
 
 NoiseStructure = Literal["shared", "independent"]
 
@@ -117,14 +117,14 @@ class Modes:
         object.__setattr__(self, "feedthrough", D)
         object.__setattr__(self, "_several", several)
         try:
-            batch = torch.broadcast_shapes(
+            batch = broadcast(
                 poles.shape[:-1],
                 B.shape[:-2],
                 c.shape[: c.dim() - 1 - several],
                 L.shape[:-2],
                 D.shape[: D.dim() - 1 - several],
             )
-        except RuntimeError as error:
+        except ValueError as error:
             raise invalid(
                 "Modes", expected="batch dimensions that broadcast", got=str(error)
             ) from error

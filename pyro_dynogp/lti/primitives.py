@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.overrides import handle_torch_function, has_torch_function
 
+from pyro_dynogp._tensors import broadcast
 from pyro_dynogp.lti import recursions
 
 
@@ -123,7 +124,7 @@ def run(function: type[torch.autograd.Function], constants: tuple[Any, ...], *ar
 
 def flatten_batch(args: list[Tensor], events: list[int]) -> tuple[list[Tensor], torch.Size]:
     """Broadcast the batch dimensions left of `events` trailing ones; make them one."""
-    batch = torch.broadcast_shapes(
+    batch = broadcast(
         *(a.shape[: a.dim() - k] for a, k in zip(args, events, strict=True))
     )
     count = batch.numel()

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from pyro_dynogp._errors import invalid
 from pyro_dynogp._tensors import as_tensor
+from pyro_dynogp.lti.fused import propagators
 from pyro_dynogp.lti.grid import TimeGrid, time_grid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.primitives import array, flatten_batch, run
@@ -127,12 +128,6 @@ def complex_expm1(z: Tensor) -> Tensor:
     half = torch.sin(0.5 * b)
     real = torch.expm1(a) * torch.cos(b) - 2.0 * half * half
     return torch.complex(real, torch.exp(a) * torch.sin(b))
-
-
-def propagators(modes: Modes, steps: Tensor) -> tuple[Tensor, Tensor]:
-    """exp(lambda d) and the held input's gain (exp(lambda d) - 1)/lambda, each (*b, m, P)."""
-    z = modes.poles.unsqueeze(-2) * steps.to(modes.poles.device).unsqueeze(-1)
-    return torch.exp(z), complex_expm1(z) / modes.poles.unsqueeze(-2)
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from pyro_dynogp.lti.covariance import (
     state_output_covariance,
     stationary_variance,
 )
+from pyro_dynogp.lti.fused import output_rows, propagators
 from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.lti.modes import Modes
 
@@ -74,8 +75,8 @@ class SemiseparableCovariance:
     @cached_property
     def _rows(self) -> primitives.Generators:
         modes, grid = self.modes, self.grid
-        phi = torch.exp(modes.poles.unsqueeze(-2) * grid.steps.unsqueeze(-1))
-        q = state_output_covariance(modes)
+        phi, _ = propagators(modes, grid.steps)
+        h, g, k0 = output_rows(modes)
         step, out = grid.rows(modes.outputs)
         if self.initial_covariance is None:
             S0 = torch.zeros(
@@ -86,9 +87,9 @@ class SemiseparableCovariance:
         return primitives.Generators(
             re=phi.real,
             im=phi.imag,
-            h=output_row(modes),
-            g=torch.cat([q.real, q.imag], dim=-1),
-            k0=2.0 * (modes.C * q).sum(-1).real,
+            h=h,
+            g=g,
+            k0=k0,
             S0=S0,
             step=step,
             out=out,
@@ -207,16 +208,21 @@ class SemiseparableCovariance:
 
     def inverse_diagonal(self) -> Tensor:
         """Diagonal of K^{-1} (*b, N); zero in missing rows."""
-        d = self.innovation_variance
-        kappa = primitives.later_information(self._rows, self._factor[0], d)
-        return 1.0 / d + kappa / d.square()
+        e, _, d, _, _ = self._factor
+        kappa = primitives.later_information(self._rows, e, d)
+        missing = torch.isinf(d)
+        # One in place of infinity: what is not used must not be 0/0 in the gradient either.
+        finite = torch.where(missing, torch.ones_like(d), d)
+        return torch.where(missing, torch.zeros_like(d), 1.0 / finite + kappa / finite.square())
 
     def signal_variance(self) -> Tensor:
         """Variance of the noise-free output at every row, missing ones too, given all (*b, N)."""
         e, p, d, _, _ = self._factor
         kappa = primitives.later_information(self._rows, e, d)
-        share = torch.where(self.missing, torch.ones_like(d), self.noise_variance / d)
-        share = torch.where(self.missing, torch.ones_like(d), share)
+        missing = torch.isinf(d)
+        one = torch.ones_like(d)
+        v = torch.where(missing, one, self.noise_variance)
+        share = v / torch.where(missing, one, d)
         return (share * p - share.square() * kappa).clamp_min(0.0)
 
     def log_prob(self, residual: Tensor) -> Tensor:

@@ -84,8 +84,9 @@ def _histogram(axes: Axes, e: np.ndarray) -> None:
     if not 12 <= len(edges) <= 60:  # outliers stretch, few samples coarsen the automatic bins
         edges = np.linspace(seen.min(), seen.max(), int(np.clip(len(edges), 12, 60)))
     axes.hist(
-        seen, bins=edges.tolist(), density=True, color="#BFBFBF", edgecolor="white", label="errors"
-    )
+        seen, bins=edges.tolist(), density=True, color="#BFBFBF", edgecolor="white", linewidth=0.4,
+        label="errors",
+    )  # fmt: skip
     reach = max(3.5, float(np.abs(seen).max()))
     grid = np.linspace(-reach, reach, 300)
     density = np.exp(-0.5 * grid**2) / np.sqrt(2.0 * np.pi)

@@ -143,8 +143,6 @@ def _leave_out(axes: Axes, x: np.ndarray, drawn: np.ndarray, skip: int) -> None:
     # Up to the middle between the last sample left out and the first that counts.
     axes.axvspan(x[0], 0.5 * (x[skip - 1] + x[skip]), color="#E9E4D4", zorder=0, label="not scored")
     low, high = np.nanmin(drawn[:, skip:]), np.nanmax(drawn[:, skip:])
-    first = drawn[2, :skip][np.isfinite(drawn[2, :skip])]
-    low, high = min(low, *first, low), max(high, *first, high)
     margin = 0.06 * (high - low)
     axes.set_ylim(low - margin, high + margin)
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MultipleLocator
 
 from pyro_dynogp._errors import invalid
 from pyro_dynogp.lti import views
@@ -110,8 +111,10 @@ def bode(fit: Fit, omega: Any = None) -> Figure:
             G = response[:, :, a, b]
             style.draw_bands(magnitude, grid, 20.0 * np.log10(np.abs(G)))
             style.draw_bands(phase, grid, _unwrapped(G))
-            # A scale that steps by right angles, in which a phase is read.
-            phase.yaxis.get_major_locator().set_params(steps=[1, 1.8, 3.6, 4.5, 9, 10])
+            # Ticks at parts or multiples of right angles, in which a phase is read.
+            low, high = phase.dataLim.intervaly
+            ticks = next((step for step in (15, 30, 45, 90, 180) if high - low < 7 * step), 360)
+            phase.yaxis.set_major_locator(MultipleLocator(ticks))
             style.label(magnitude, y="magnitude [dB]")
             style.label(phase, y="phase [degrees]")
             style.title(

@@ -22,7 +22,7 @@ class Prediction:
     mixture, whose moments, quantiles and densities here are exact.
 
     Attributes:
-        time: (n,) [s].
+        time: (n,) in the unit of the record.
         output_names: of the n_y outputs.
         component_mean: (S, n, n_y) mean for each draw.
         component_variance: (S, n, n_y) variance of the noise-free output for each draw.

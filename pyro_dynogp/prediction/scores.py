@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import scoringrules
 
 from pyro_dynogp._errors import invalid
 from pyro_dynogp.prediction.prediction import Prediction
@@ -91,6 +90,8 @@ def _inside(y: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
 
 
 def _crps(prediction: Prediction, there: np.ndarray, a: int, y: np.ndarray) -> float:
+    import scoringrules  # its import compiles code, which takes seconds
+
     mean = prediction.component_mean[:, there, a]
     sd = prediction.component_sd[:, there, a]
     if len(mean) == 1:

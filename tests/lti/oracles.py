@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 import torch
 from hypothesis import settings
-from scipy.linalg import expm, solve_continuous_lyapunov
+from scipy.linalg import solve_continuous_lyapunov
 
 from pyro_dynogp.lti.modes import Modes
 
@@ -107,15 +107,33 @@ def random_covariance(J, seed=0):
     return R @ R.T / J
 
 
+def expm(M):
+    """Exponentials of matrices (..., J, J): the power series after scaling, then squaring.
+
+    scipy's does the same one matrix at a time, too slow for a covariance of many lags
+    (test_oracles.py compares the two).
+    """
+    M = np.asarray(M, dtype=float)
+    doublings = int(np.ceil(np.log2(max(np.abs(M).sum(-1).max(), 1.0)))) + 1
+    X = M / 2.0**doublings
+    term = E = np.broadcast_to(np.eye(M.shape[-1]), M.shape)
+    for j in range(1, 19):  # 2^-18 / 18! is far below double precision
+        term = term @ X / j
+        E = E + term
+    for _ in range(doublings):
+        E = E @ E
+    return E
+
+
 def mean(system, time, u, z0=None):
     """Outputs (n, n_y) and states (n, 2P) for inputs held over each step."""
     J, n_u = system.B.shape
     z = np.zeros(J) if z0 is None else np.asarray(z0, dtype=float)
+    block = np.zeros((J + n_u, J + n_u))
+    block[:J] = np.hstack([system.A, system.B])
     states = [z]
-    for k in range(len(time) - 1):
-        block = np.zeros((J + n_u, J + n_u))
-        block[:J] = np.hstack([system.A, system.B])
-        z = (expm(block * (time[k + 1] - time[k])) @ np.concatenate([z, u[k]]))[:J]
+    for k, E in enumerate(expm(block * np.diff(time)[:, None, None])):
+        z = (E @ np.concatenate([z, u[k]]))[:J]
         states.append(z)
     states = np.array(states)
     return states @ system.C.T + u @ system.D.T, states
@@ -155,9 +173,7 @@ def sampled_noise(system, step):
 def log_density(residual, K):
     """Log N(residual; 0, K)."""
     solved = np.linalg.solve(K, residual)
-    return -0.5 * (
-        residual @ solved + np.linalg.slogdet(K)[1] + len(residual) * np.log(2 * np.pi)
-    )
+    return -0.5 * (residual @ solved + np.linalg.slogdet(K)[1] + len(residual) * np.log(2 * np.pi))
 
 
 def tensor(x):

@@ -43,8 +43,8 @@ def test_state_and_output(noise):
 
 def test_noise_structures_differ_for_several_pairs_only():
     shared, independent = (random_system(2, noise=noise) for noise in NOISES)
-    S, I = (stationary_variance(s.modes).item() for s in (shared, independent))  # noqa: E741
-    assert abs(S - I) > 0.1 * I
+    one, other = (stationary_variance(s.modes).item() for s in (shared, independent))
+    assert abs(one - other) > 0.1 * other
     shared, independent = (random_system(2, pairs=1, noise=noise) for noise in NOISES)
     assert_close(stationary_variance(shared.modes), stationary_variance(independent.modes))
 

@@ -69,5 +69,5 @@ def test_batches():
 @pytest.mark.parametrize("horizon", [0, -1, 1.5, "2"])
 def test_horizon_must_be_a_count(horizon):
     K = SemiseparableCovariance(random_system(0).modes, [0.0, 1.0], 0.1)
-    with pytest.raises(ValueError, match="horizon.*>= 1"):
+    with pytest.raises(ValueError, match=r"horizon.*>= 1"):
         predict_k_steps(K, torch.zeros(2, dtype=torch.float64), horizon)

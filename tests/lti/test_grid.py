@@ -15,6 +15,7 @@ from pyro_dynogp.lti.grid import time_grid
         ([[0.0, 1.0]], r"time.*\(1, 2\)"),
         ([0.0, np.nan, 1.0], "time.*finite.*nan at index 1"),
         ([0.0, np.inf], "time.*finite.*inf at index 1"),
+        (np.arange(3.0)[::-1], "time.*decrease.*1.0 after 2.0 at index 1"),
         ([0.0, 1.0, 0.5], "time.*decrease.*0.5 after 1.0 at index 2.*[Ss]ort"),
     ],
 )

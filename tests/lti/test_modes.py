@@ -66,7 +66,7 @@ class TestErrors:
             Modes(**GOOD | {"feedthrough": D})
 
     def test_index_without_batch(self):
-        with pytest.raises(ValueError, match="Modes.*batch"):
+        with pytest.raises(ValueError, match=r"Modes.*batch"):
             Modes(**GOOD)[0]
 
     def test_index_must_not_reach_beyond_the_batch(self):

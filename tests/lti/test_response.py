@@ -250,7 +250,7 @@ class TestHold:
         assert hold([0.0, 0.5, 0.5], u, at)[:, 0].tolist() == [3, 3]
 
     def test_before_the_first_sample(self):
-        with pytest.raises(ValueError, match="at.*from 1.0 on.*0.5"):
+        with pytest.raises(ValueError, match=r"at.*from 1.0 on.*0.5"):
             hold([1.0, 2.0], torch.zeros(2, 1), torch.tensor([1.5, 0.5], dtype=torch.float64))
 
 

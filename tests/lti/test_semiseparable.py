@@ -254,7 +254,7 @@ class TestErrors:
         modes = random_system(0).modes
         with pytest.raises(ValueError, match=r"noise_variance.*4.*\(3,\)"):
             SemiseparableCovariance(modes, np.arange(4.0), np.ones(3))
-        with pytest.raises(ValueError, match="noise_variance.*>= 0.*-1"):
+        with pytest.raises(ValueError, match=r"noise_variance.*>= 0.*-1"):
             SemiseparableCovariance(modes, np.arange(4.0), -1.0)
         with pytest.raises(ValueError, match="noise_variance"):
             SemiseparableCovariance(modes, np.arange(4.0), float("nan"))
@@ -274,7 +274,7 @@ class TestErrors:
 
     def test_singular(self):
         K = SemiseparableCovariance(random_system(0).modes, [0.0, 1.0, 1.0], 0.0)
-        with pytest.raises(NotPositiveDefiniteError, match="row 2.*repeated times"):
+        with pytest.raises(NotPositiveDefiniteError, match=r"row 2.*repeated times"):
             K.log_determinant()
 
     def test_no_process_noise_and_no_measurement_noise(self):
@@ -286,7 +286,7 @@ class TestErrors:
         modes = random_system(0).modes
         K = SemiseparableCovariance(modes, [0.0, 1.0], 0.1, torch.eye(6, dtype=torch.float64))
         X = torch.zeros(2, 1, dtype=torch.float64)
-        with pytest.raises(ValueError, match="time.*from 0.0 on"):
+        with pytest.raises(ValueError, match=r"time.*from 0.0 on"):
             K.cross_matmul([-1.0, 0.5], X)
-        with pytest.raises(ValueError, match="time.*decrease"):
+        with pytest.raises(ValueError, match=r"time.*decrease"):
             K.cross_matmul([0.5, 0.2], X)

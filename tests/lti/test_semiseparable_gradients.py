@@ -1,4 +1,4 @@
-"""Reverse mode of the O(n) algebra: numerical derivatives, and the dense twin's beyond a segment."""
+"""Reverse mode of the O(n) algebra: numerical derivatives, and beyond a segment the dense twin."""
 
 import numpy as np
 import pytest

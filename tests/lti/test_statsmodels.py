@@ -139,10 +139,10 @@ def test_predictions(case, horizon):
     assert_close(ours.variance.reshape(n, n_y), variance)
 
 
+@pytest.mark.parametrize("case", ["plain", "known start", "independent"], indirect=True)
 def test_innovations(case):
-    # Forecast errors and their variances, one output (several are taken one after the other).
-    if case.y.shape[1] > 1:
-        pytest.skip("statsmodels takes the outputs of a time together")
+    # Forecast errors and their variances; one output, for statsmodels takes those of a time
+    # together and we take one after the other.
     filtered = case.filter().filter()
     ours = case.covariance.innovations(case.residual.unsqueeze(-1))[:, 0]
     assert_close(ours, filtered.forecasts_error[0])

@@ -4,7 +4,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import example, given
 from scipy import signal
 from scipy.linalg import expm
 
@@ -36,7 +36,9 @@ class TestStateSpace:
         eye = np.eye(6)
         for w in OMEGA:
             inner = np.linalg.inv(1j * w * eye - ss.A.numpy())
-            assert_close(ss.C.numpy() @ inner @ ss.B.numpy() + ss.D.numpy(), transfer(system, 1j * w))
+            assert_close(
+                ss.C.numpy() @ inner @ ss.B.numpy() + ss.D.numpy(), transfer(system, 1j * w)
+            )
             noise_gain = system.C @ np.linalg.solve(1j * w * eye - system.A, system.L)
             assert_close(ss.C.numpy() @ inner @ ss.L.numpy(), noise_gain)
 
@@ -59,9 +61,7 @@ class TestStateSpace:
 
 class TestDiscrete:
     @few
-    @given(
-        seed=st.integers(0, 1000), step=st.floats(0.01, 3.0), noise=st.sampled_from(NOISES)
-    )
+    @given(seed=st.integers(0, 1000), step=st.floats(0.01, 3.0), noise=st.sampled_from(NOISES))
     def test_against_scipy(self, seed, step, noise):
         system = random_system(seed, outputs=2, noise=noise)
         d = views.discrete_state_space(system.modes, step)
@@ -159,6 +159,7 @@ class TestTimeResponses:
 
 
 class TestMatern32:
+    @example(lengthscale=1.0, sd=1.0, split=1e-4)  # the default
     @few
     @given(
         lengthscale=st.floats(1e-3, 1e3),
@@ -193,6 +194,12 @@ def test_gradients_flow():
         modes = Modes(poles, B, c, system.L_modal)
         d = views.discrete_state_space(modes, 0.3)
         t = torch.tensor([0.1, 1.0], dtype=torch.float64)
-        return d.A, d.B, d.Q, views.step_response(modes, t), views.transfer_function(modes).numerator
+        return (
+            d.A,
+            d.B,
+            d.Q,
+            views.step_response(modes, t),
+            views.transfer_function(modes).numerator,
+        )
 
     assert torch.autograd.gradcheck(f, values)

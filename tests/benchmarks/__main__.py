@@ -1,0 +1,45 @@
+"""Run the benchmarks and write one results page: ``make benchmark``, or with names of parts."""
+
+from __future__ import annotations
+
+import platform
+import sys
+import time
+from pathlib import Path
+
+import joblib
+import numba
+import torch
+
+from tests.benchmarks import calibration, example2, speed
+
+PARTS = {"speed": speed.run, "example2": example2.run, "calibration": calibration.run}
+
+
+def main(names: list[str]) -> int:
+    unknown = set(names) - set(PARTS)
+    if unknown:
+        print(f"Unknown parts {sorted(unknown)}; there are {', '.join(PARTS)}.", file=sys.stderr)
+        return 2
+    folder = Path("benchmark_output")
+    folder.mkdir(exist_ok=True)
+    for name in names or PARTS:
+        begin = time.perf_counter()
+        text = PARTS[name](folder)
+        minutes = (time.perf_counter() - begin) / 60
+        head = (
+            f"Python {platform.python_version()}, torch {torch.__version__}, "
+            f"numba {numba.__version__}, {joblib.cpu_count()} processors; "
+            f"this part took {minutes:.1f} minutes.\n\n"
+        )
+        (folder / f"{name}.md").write_text(f"## {name}\n\n{head}{text}\n")
+        print((folder / f"{name}.md").read_text())
+    page = "\n".join((folder / f"{n}.md").read_text() for n in PARTS if
+                     (folder / f"{n}.md").exists())  # fmt: skip
+    (folder / "results.md").write_text(f"# Benchmark results\n\n{page}")
+    print(f"Written: {folder / 'results.md'}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

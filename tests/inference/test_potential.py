@@ -1,0 +1,87 @@
+"""The log joint density as a function of one vector."""
+
+import numpy as np
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+from scipy.optimize import approx_fprime
+
+import pyro_dynogp as dgp
+from pyro_dynogp.inference.potential import Potential, laplace_root
+from pyro_dynogp.inference.starts import starting_values
+
+
+@pytest.fixture(scope="module")
+def potential(record):
+    model = dgp.LinearDynamicGP(inputs=1, pairs=2).scaled_to(record)
+    values = starting_values(model, (record,), count=1, seed=0)[0]
+    return Potential(model, (record,), values), values
+
+
+@pytest.mark.parametrize("jacobian", [False, True])
+def test_gradient_against_finite_differences(potential, jacobian):
+    function, values = potential
+    z = function.pack(values).numpy() + 0.05 * np.random.default_rng(0).standard_normal(
+        function.size
+    )
+    numeric = approx_fprime(
+        z, lambda x: function.value_and_gradient(x, jacobian=jacobian)[0], 1e-6
+    )
+    exact = function.value_and_gradient(z, jacobian=jacobian)[1]
+    np.testing.assert_allclose(exact, numeric, rtol=2e-4, atol=1e-4 * np.abs(exact).max())
+
+
+def test_pack_and_unpack_are_inverse(potential):
+    function, values = potential
+    again = function.unpack(function.pack(values))
+    for name, value in values.items():
+        torch.testing.assert_close(again[name], value, rtol=1e-10, atol=1e-12)
+
+
+def test_energy_is_the_trace_of_the_model(potential, record):
+    function, values = potential
+    conditioned = pyro.poutine.condition(function.model, data=values)
+    expected = -float(pyro.poutine.trace(conditioned).get_trace(record).log_prob_sum())
+    assert function.value_and_gradient(function.pack(values).numpy())[0] == pytest.approx(expected)
+
+
+def test_jacobian_makes_a_density_of_the_unconstrained_vector():
+    """A log-normal variable has a normal logarithm: the energy with Jacobian must say so."""
+
+    def model():
+        pyro.sample("x", dist.LogNormal(torch.tensor(0.3).double(), 0.7))
+
+    function = Potential(model, (), {"x": torch.tensor(1.0).double()})
+    for z in (-1.0, 0.5):
+        expected = -torch.distributions.Normal(0.3, 0.7).log_prob(torch.tensor(z))
+        got = function.value_and_gradient(np.array([z]), jacobian=True)[0]
+        assert got == pytest.approx(float(expected), rel=1e-6)
+
+
+def test_hessian_and_laplace_root_of_a_normal():
+    covariance = np.array([[2.0, 0.6], [0.6, 0.5]])
+
+    def model():
+        mean = torch.zeros(2, dtype=torch.float64)
+        pyro.sample("x", dist.MultivariateNormal(mean, torch.as_tensor(covariance)))
+
+    function = Potential(model, (), {"x": torch.zeros(2, dtype=torch.float64)})
+    H = function.hessian(np.array([0.2, -0.1]))
+    np.testing.assert_allclose(H, np.linalg.inv(covariance), rtol=1e-6)
+    root = laplace_root(H)
+    np.testing.assert_allclose(root @ root.T, covariance, rtol=1e-6)
+
+
+def test_laplace_root_bounds_flat_directions():
+    root = laplace_root(np.diag([4.0, 0.0, -1.0]), widest=3.0)
+    np.testing.assert_allclose(np.diag(root @ root.T), [0.25, 9.0, 9.0])
+
+
+def test_out_of_range_is_a_wall_not_a_crash(potential):
+    function, values = potential
+    z = function.pack(values).numpy()
+    z[:] = 800.0
+    energy, gradient = function.value_and_gradient(z)
+    assert energy == 1e15
+    assert not gradient.any()

@@ -1,0 +1,132 @@
+"""Mixture moments, quantiles and densities; scores."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import pyro_dynogp as dgp
+from pyro_dynogp.prediction.prediction import Prediction
+
+
+def mixture(draws=5, n=7, n_y=2, seed=0):
+    rng = np.random.default_rng(seed)
+    return Prediction(
+        time=np.arange(n) * 1.0,
+        output_names=("a", "b")[:n_y],
+        component_mean=rng.normal(size=(draws, n, n_y)),
+        component_variance=rng.uniform(0.1, 1.0, (draws, n, n_y)),
+        noise_variance=rng.uniform(0.1, 0.3, (draws, n_y)),
+        parts={},
+        sampler=lambda: np.zeros((1, n, n_y)),
+        kind="test",
+    )
+
+
+def test_moments_and_quantiles_against_sampling_of_the_mixture():
+    p = mixture()
+    rng = np.random.default_rng(1)
+    which = rng.integers(5, size=200_000)
+    draws = p.component_mean[which] + p.component_sd[which] * rng.standard_normal((200_000, 7, 2))
+    np.testing.assert_allclose(draws.mean(0), p.mean, atol=5 * p.sd.max() / np.sqrt(2e5))
+    np.testing.assert_allclose(draws.std(0), p.sd, rtol=0.01)
+    for q in (0.025, 0.4):
+        below = (draws < p.quantile(q)).mean(0)
+        np.testing.assert_allclose(below, q, atol=5 * np.sqrt(q * (1 - q) / 2e5))
+    assert p.quantile([0.1, 0.5, 0.9]).shape == (3, 7, 2)
+    assert (p.signal_variance < p.variance).all()
+
+
+def test_single_component_is_the_normal():
+    p = mixture(draws=1)
+    np.testing.assert_allclose(
+        p.quantile(0.9), stats.norm.ppf(0.9, p.mean, p.sd), rtol=1e-12
+    )
+    y = p.mean + 0.3
+    np.testing.assert_allclose(p.log_density(y), stats.norm.logpdf(y, p.mean, p.sd), rtol=1e-12)
+    np.testing.assert_allclose(p.probability_integral(y), stats.norm.cdf(y, p.mean, p.sd))
+
+
+@pytest.mark.parametrize("q", [0.0, 1.0, -0.1, [0.5, 1.2]])
+def test_quantiles_outside_the_unit_interval(q):
+    with pytest.raises(ValueError, match="q: expected probabilities between 0 and 1"):
+        mixture().quantile(q)
+
+
+def test_table_has_a_column_for_each_number():
+    frame = mixture().to_frame()
+    assert list(frame.columns)[:4] == ["a mean", "a sd", "a 2.5 %", "a 97.5 %"]
+    assert frame.index.name == "time"
+
+
+def scored(draws, n=400, seed=3):
+    p = mixture(draws=draws, n=n, n_y=1, seed=seed)
+    rng = np.random.default_rng(seed + 1)
+    which = rng.integers(draws, size=n)
+    index = np.arange(n)
+    y = p.component_mean[which, index] + p.component_sd[which, index] * rng.standard_normal((n, 1))
+    return p, dgp.Record(time=p.time, outputs=y)
+
+
+def test_scores_against_their_definitions():
+    p, record = scored(4)
+    s = dgp.scores(p, record)
+    error = record.outputs - p.mean
+    assert s["rmse"] == pytest.approx(np.sqrt(np.mean(error**2)))
+    assert s["mae"] == pytest.approx(np.mean(np.abs(error)))
+    assert s["nrmse"] == pytest.approx(s["rmse"] / record.outputs.std())
+    assert s["fit_percent"] == pytest.approx(100 * (1 - s["nrmse"]))
+    density = stats.norm.pdf(record.outputs[None], p.component_mean, p.component_sd).mean(0)
+    assert s["negative_log_density"] == pytest.approx(-np.log(density).mean())
+    assert s["count"] == 400
+
+
+@pytest.mark.parametrize("draws", [1, 4])
+def test_crps_is_the_integral_of_the_squared_error_of_the_distribution(draws):
+    p, record = scored(draws, n=25)
+    grid = np.linspace(-12, 12, 24_001)
+    F = stats.norm.cdf(
+        grid[:, None], p.component_mean[:, None, :, 0], p.component_sd[:, None, :, 0]
+    ).mean(0)
+    step = (grid[:, None] >= record.outputs[:, 0]).astype(float)
+    crps = np.trapezoid((F - step) ** 2, grid, axis=0)
+    assert dgp.scores(p, record)["crps"] == pytest.approx(crps.mean(), rel=1e-3)
+
+
+def test_coverage_of_a_true_prediction_is_nominal():
+    p, record = scored(3, n=4000)
+    s = dgp.scores(p, record)
+    assert s["coverage_95"] == pytest.approx(0.95, abs=4 * np.sqrt(0.95 * 0.05 / 4000))
+    assert s["coverage_50"] == pytest.approx(0.50, abs=4 * np.sqrt(0.25 / 4000))
+
+
+def test_skip_and_missing_samples_are_left_out():
+    p, record = scored(2, n=50)
+    y = record.outputs.copy()
+    y[:10] = 1e6
+    y[20] = np.nan
+    s = dgp.scores(p, record.with_outputs(y), skip=10)
+    assert s["count"] == 39
+    assert s["rmse"] < 10
+
+
+def test_several_outputs_give_arrays():
+    p = mixture(n=30)
+    record = dgp.Record(time=p.time, outputs=p.mean + np.array([0.1, 0.2]))
+    s = dgp.scores(p, record)
+    np.testing.assert_allclose(s["rmse"], [0.1, 0.2])
+    assert s["coverage_95"].shape == (2,)
+
+
+def test_scores_refuse_what_does_not_belong_together():
+    p, record = scored(1, n=20)
+    with pytest.raises(ValueError, match="prediction: expected the 19 times"):
+        dgp.scores(p, record[1:])
+    shifted = dgp.Record(time=record.time + 0.5, outputs=record.outputs)
+    with pytest.raises(ValueError, match="other times of the same number"):
+        dgp.scores(p, shifted)
+    with pytest.raises(ValueError, match="skip: expected a number from 0 to 19"):
+        dgp.scores(p, record, skip=20)
+    with pytest.raises(ValueError, match="record: expected 1 measured outputs"):
+        dgp.scores(p, dgp.Record(time=record.time))
+    with pytest.raises(ValueError, match="expected measured samples"):
+        dgp.scores(p, record.with_outputs(np.full(20, np.nan)))
