@@ -35,6 +35,8 @@ def as_tensor(
     """Tensor of the given dtype; read-only arrays (those of a Record) are copied."""
     if isinstance(value, Tensor):
         return value.to(dtype=dtype, device=device or value.device)
-    if isinstance(value, np.ndarray) and (not value.flags.writeable or min(value.strides, default=0) < 0):
+    if isinstance(value, np.ndarray) and (
+        not value.flags.writeable or min(value.strides, default=0) < 0
+    ):
         value = value.copy()
     return torch.as_tensor(value, dtype=dtype, device=device)

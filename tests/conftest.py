@@ -44,7 +44,7 @@ def map_fit(record):
 def svi_fit(record):
     model = dgp.LinearDynamicGP(inputs=1, pairs=1)
     return dgp.fit(
-        model, record[:160], method="svi", starts=2, steps=300, draws=40, workers=1, progress=False
+        model, record[:160], method="svi", starts=2, steps=60, draws=40, workers=1, progress=False
     )
 
 

@@ -39,6 +39,8 @@ class ConditionedLTIProcess(Trajectory):
         residual: y - m (*batch, N), zero where missing.
     """
 
+    has_innovations = False
+
     def __init__(
         self, observed: ObservedLTIProcess, y: Any, *, validate_args: bool | None = None
     ) -> None:

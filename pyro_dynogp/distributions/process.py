@@ -67,6 +67,8 @@ class LTIProcess(Trajectory):
             x0 = as_tensor(initial_state, torch.complex128, modes.poles.device)
             initial_state = ModalState(x0)
         self.initial_state: ModalState | None = initial_state
+        if initial_state is not None:
+            _check_state(initial_state, modes.pairs)
         self.jitter = jitter
         shapes = [modes.batch_shape, self.inputs.shape[:-2]]
         if initial_state is not None:
@@ -148,6 +150,17 @@ class LTIProcess(Trajectory):
         from pyro_dynogp.distributions.conditioned import ConditionedLTIProcess
 
         return ConditionedLTIProcess(self.observed(noise_sd, varying=varying), y)
+
+
+def _check_state(state: ModalState, pairs: int) -> None:
+    P = state.covariance
+    if state.mean.shape[-1:] != (pairs,) or (P is not None and P.shape[-2:] != (2 * pairs,) * 2):
+        covariance = "None" if P is None else f"shape {tuple(P.shape)}"
+        raise invalid(
+            "initial_state",
+            expected=f"mean (..., {pairs}) and covariance (..., {2 * pairs}, {2 * pairs}) or None",
+            got=f"mean of shape {tuple(state.mean.shape)}, covariance {covariance}",
+        )
 
 
 class ObservedLTIProcess(Trajectory):

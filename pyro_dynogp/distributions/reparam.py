@@ -25,11 +25,15 @@ class InnovationReparam(Reparam):
     def apply(self, msg: Any) -> Any:
         """Rewrite one sample message (called by Pyro)."""
         fn, event_dim = self._unwrap(msg["fn"])
-        if not isinstance(fn, Trajectory):
+        where = f"InnovationReparam for site '{msg['name']}'"
+        if not isinstance(fn, Trajectory) or not fn.has_innovations:
+            raise invalid(where, expected="an LTIProcess", got=type(fn).__name__)
+        if msg["is_observed"]:
             raise invalid(
-                f"InnovationReparam for site '{msg['name']}'",
-                expected="an LTIProcess",
-                got=type(fn).__name__,
+                where,
+                expected="a latent site",
+                got="an observed one",
+                advice="Condition the model on the innovations, or condition without the reparam.",
             )
         value = msg["value"]
         noise = None if value is None else fn.to_innovations(value)
@@ -39,7 +43,7 @@ class InnovationReparam(Reparam):
             f"{msg['name']}_innovations",
             dist.Normal(zero, zero + 1.0).expand(shape).to_event(event_dim),
             obs=noise,
-            infer={"is_observed": msg["is_observed"]},
+            infer={"is_observed": False},
         )
         if value is None:
             value = fn.from_innovations(noise)

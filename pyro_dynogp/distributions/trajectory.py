@@ -11,7 +11,7 @@ from pyro.distributions import TorchDistribution, constraints
 from torch import Tensor
 
 from pyro_dynogp._errors import invalid
-from pyro_dynogp._tensors import as_tensor, broadcast
+from pyro_dynogp._tensors import as_tensor
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.semiseparable import SemiseparableCovariance
 
@@ -30,11 +30,14 @@ class Trajectory(TorchDistribution):
     """Base of the distributions over whole trajectories, N(mean, S + diag(v)), everything O(n).
 
     Event shape (n,), or (n, n_y) where the modes have an output dimension; a row of the algebra is
-    one output at one time, N = n n_y of them.
+    one output at one time, N = n n_y of them. The factorisation is kept with its gradient graph:
+    make a new distribution for each backward pass.
     """
 
     arg_constraints: dict[str, constraints.Constraint] = {}  # noqa: RUF012 (torch's own attribute)
     has_rsample = True
+    # Whether values are standard normal innovations pushed through `root`.
+    has_innovations = True
 
     modes: Modes
 
@@ -61,7 +64,11 @@ class Trajectory(TorchDistribution):
     def expand(self, batch_shape: Any, _instance: Any = None) -> Any:
         """Broadcast to a larger batch shape; nothing is copied."""
         shape = torch.Size(batch_shape)
-        if broadcast(shape, self.batch_shape) != shape:
+        own = self.batch_shape
+        fits = len(own) <= len(shape) and all(
+            a in (1, b) for a, b in zip(own[::-1], shape[::-1], strict=False)
+        )
+        if not fits:
             raise invalid(
                 "batch_shape",
                 expected=f"a shape that {tuple(self.batch_shape)} broadcasts to",

@@ -83,9 +83,7 @@ class Potential:
             value = site.transform(part)
             values[site.name] = value
             if jacobian:
-                log_jacobian = (
-                    log_jacobian + site.transform.log_abs_det_jacobian(part, value).sum()
-                )
+                log_jacobian = log_jacobian + site.transform.log_abs_det_jacobian(part, value).sum()
         return -self.log_joint(values) - log_jacobian
 
     def value_and_gradient(
@@ -119,7 +117,6 @@ class Potential:
             down = self.value_and_gradient(z - shift, jacobian=True)[1]
             H[i] = (up - down) / (2.0 * step)
         return 0.5 * (H + H.T)
-
 
     def laplace(
         self, values: Mapping[str, Tensor], *, widest: float

@@ -49,6 +49,27 @@ def real_covariance(hermitian: Tensor, symmetric: Tensor) -> Tensor:
     )
 
 
+def complex_expm1(z: Tensor) -> Tensor:
+    """Compute exp(z) - 1 without cancellation for small complex z."""
+    a, b = z.real, z.imag
+    half = torch.sin(0.5 * b)
+    real = torch.expm1(a) * torch.cos(b) - 2.0 * half * half
+    return torch.complex(real, torch.exp(a) * torch.sin(b))
+
+
+def step_noise(modes: Modes, step: float) -> Tensor:
+    """Covariance (*b, 2P, 2P) that process noise adds to [Re x; Im x] within a step [s].
+
+    Equal to P - Phi P Phi' for the stationary P, without its cancellation at short steps.
+    """
+    lam = modes.poles
+    hermitian, symmetric = modal_covariance(modes)
+    sums = lam.unsqueeze(-1) + lam.conj().unsqueeze(-2), lam.unsqueeze(-1) + lam.unsqueeze(-2)
+    return real_covariance(
+        -hermitian * complex_expm1(sums[0] * step), -symmetric * complex_expm1(sums[1] * step)
+    )
+
+
 def state_covariance(modes: Modes) -> Tensor:
     """Stationary covariance (*b, 2P, 2P) of the real state [Re x; Im x] that noise drives."""
     return real_covariance(*modal_covariance(modes))

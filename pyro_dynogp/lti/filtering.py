@@ -16,7 +16,7 @@ from pyro_dynogp.lti.primitives import array, flatten_batch
 from pyro_dynogp.lti.semiseparable import SemiseparableCovariance
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _emit(F, S, lam, h, k0, age, j, out_mean, out_variance):
     """Mean and variance of every output at an age [s] after the state F, S; F may be empty."""
     pairs = lam.shape[0]
@@ -37,7 +37,7 @@ def _emit(F, S, lam, h, k0, age, j, out_mean, out_variance):
         out_variance[j * h.shape[0] + a] = k0[a] - explained
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _k_step(re, im, step, lam, time, h, g, k0, v, S0, Y, horizon):
     """Means (b, N) and variances (b, N) of the noise-free outputs given samples k steps before."""
     batch, rows = v.shape

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal, cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -77,7 +78,8 @@ class Modes:
         if self.feedthrough is None:
             D = torch.zeros(tail, dtype=torch.float64, device=poles.device)
         else:
-            if torch.is_tensor(self.feedthrough) and self.feedthrough.is_complex():
+            given = self.feedthrough
+            if given.is_complex() if torch.is_tensor(given) else np.iscomplexobj(given):
                 raise invalid("feedthrough", expected="real numbers", got="complex ones")
             D = as_tensor(self.feedthrough, torch.float64, poles.device)
             if D.shape[D.dim() - len(tail) :] != tail:
@@ -223,11 +225,16 @@ class Modes:
         return self._map(lambda x, k: x.expand(shape + x.shape[x.dim() - k :]))
 
     def __getitem__(self, index: Any) -> Modes:
-        """Index the batch dimensions."""
+        """Index the batch dimensions, and only these.
+
+        Raises:
+            ValueError: where there are none. IndexError: where the index reaches beyond them.
+        """
         if not self.batch_shape:
             raise invalid("Modes", expected="batch dimensions to index", got="none")
+        numbers = torch.arange(self.batch_shape.numel()).reshape(self.batch_shape)[index]
         full = self.expand(self.batch_shape)
-        return full._map(lambda x, k: x[index])
+        return full._map(lambda x, k: x.reshape((-1, *x.shape[x.dim() - k :]))[numbers])
 
     def detach(self) -> Modes:
         """The same values without gradient history."""

@@ -124,9 +124,7 @@ def run(function: type[torch.autograd.Function], constants: tuple[Any, ...], *ar
 
 def flatten_batch(args: list[Tensor], events: list[int]) -> tuple[list[Tensor], torch.Size]:
     """Broadcast the batch dimensions left of `events` trailing ones; make them one."""
-    batch = broadcast(
-        *(a.shape[: a.dim() - k] for a, k in zip(args, events, strict=True))
-    )
+    batch = broadcast(*(a.shape[: a.dim() - k] for a, k in zip(args, events, strict=True)))
     count = batch.numel()
     flat = [
         a.expand(batch + a.shape[a.dim() - k :]).reshape((count, *a.shape[a.dim() - k :]))

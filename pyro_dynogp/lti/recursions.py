@@ -25,7 +25,13 @@ import numpy as np
 from numba import njit
 
 # Reassociation lets the compiler use vector instructions in sums; infinities must stay exact.
-_OPTIONS = {"cache": True, "nogil": True, "fastmath": {"reassoc", "contract", "nsz", "arcp"}}
+# Division by a pivot of zero gives infinity, which the caller tells from a covariance.
+_OPTIONS = {
+    "cache": True,
+    "nogil": True,
+    "error_model": "numpy",
+    "fastmath": {"reassoc", "contract", "nsz", "arcp"},
+}
 
 # Rows between checkpoints of an adjoint: its matrices stay in the processor's cache.
 _SEGMENT = 64
@@ -145,7 +151,7 @@ def factor_adjoint(re, im, step, out, h, g, k0, v, S0, e_bar, p_bar, S_end_bar):
     g_bar = np.zeros_like(g)
     k0_bar = np.zeros_like(k0)
     v_bar = np.zeros_like(v)
-    S0_bar = S_end_bar.copy()
+    S0_bar = 0.5 * (S_end_bar + S_end_bar.transpose(0, 2, 1))  # S is symmetric
     back = -im  # Phi' has the conjugate numbers
     length = _SEGMENT
     segments = (n + length - 1) // length

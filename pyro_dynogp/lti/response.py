@@ -122,14 +122,6 @@ class _Scan(torch.autograd.Function):
         return (None, *(torch.from_numpy(g).to(bars[0].device) for g in grads))
 
 
-def complex_expm1(z: Tensor) -> Tensor:
-    """Compute exp(z) - 1 without cancellation for small complex z."""
-    a, b = z.real, z.imag
-    half = torch.sin(0.5 * b)
-    real = torch.expm1(a) * torch.cos(b) - 2.0 * half * half
-    return torch.complex(real, torch.exp(a) * torch.sin(b))
-
-
 @dataclass(frozen=True)
 class Response:
     """Mean response of a system.

@@ -69,6 +69,13 @@ class SemiseparableCovariance:
             )
         if not bool((v >= 0).all()):
             raise invalid("noise_variance", expected="numbers >= 0", got=f"{float(v.min())}")
+        J = 2 * modes.pairs
+        if initial_covariance is not None and initial_covariance.shape[-2:] != (J, J):
+            raise invalid(
+                "initial_covariance",
+                expected=f"shape (..., {J}, {J}), of [Re x; Im x]",
+                got=f"shape {tuple(initial_covariance.shape)}",
+            )
         self.noise_variance = v
         self.initial_covariance = initial_covariance
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pyro_dynogp.lti.covariance import state_covariance
+from pyro_dynogp._errors import invalid
+from pyro_dynogp.lti.covariance import complex_expm1, state_covariance, step_noise
 from pyro_dynogp.lti.modes import Modes
-from pyro_dynogp.lti.response import complex_expm1
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,15 +42,19 @@ def propagate(
         state: distribution at the beginning.
         step: length of the gap [s], not negative.
         held_input: u (*b, n_u), constant over the gap; None for no input.
+
+    Raises:
+        ValueError: where step is negative.
     """
+    if step < 0:
+        raise invalid("step", expected="a length >= 0", got=f"{step}")
     z = modes.poles * step
     phi = torch.exp(z)
     mean = phi * state.mean
     if held_input is not None and modes.inputs:
         drive = (modes.B @ held_input.to(modes.B.dtype).unsqueeze(-1)).squeeze(-1)
         mean = mean + complex_expm1(z) / modes.poles * drive
-    stationary = state_covariance(modes)
     if state.covariance is None:
-        return ModalState(mean, stationary)
+        return ModalState(mean, state_covariance(modes))
     F = real_propagator(phi)
-    return ModalState(mean, stationary + F @ (state.covariance - stationary) @ F.mT)
+    return ModalState(mean, F @ state.covariance @ F.mT + step_noise(modes, step))

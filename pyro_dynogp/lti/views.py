@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp._tensors import as_tensor
-from pyro_dynogp.lti.covariance import state_covariance
+from pyro_dynogp.lti.covariance import complex_expm1, state_covariance, step_noise
+from pyro_dynogp.lti.fused import propagators
 from pyro_dynogp.lti.modes import Modes
-from pyro_dynogp.lti.response import complex_expm1, propagators
 from pyro_dynogp.lti.state import real_propagator
 
 
@@ -99,14 +99,13 @@ def discrete_state_space(modes: Modes, step: float) -> DiscreteStateSpace:
     phi, gamma = propagators(modes, torch.tensor([step], dtype=torch.float64))
     A = real_propagator(phi.squeeze(-2))
     drive = gamma.squeeze(-2).unsqueeze(-1) * modes.B
-    stationary = state_covariance(modes)
     return DiscreteStateSpace(
         A=A,
         B=torch.cat([drive.real, drive.imag], -2),
         C=torch.cat([2.0 * modes.C.real, -2.0 * modes.C.imag], -1),
         D=modes.D,
-        Q=stationary - A @ stationary @ A.mT,
-        stationary=stationary,
+        Q=step_noise(modes, step),
+        stationary=state_covariance(modes),
         step=float(step),
     )
 
@@ -183,16 +182,16 @@ def matern32(lengthscale: float, sd: float = 1.0, *, split: float = 1e-4) -> Mod
 
     The Matern-3/2 process has a double real pole at -a, a = sqrt(3)/lengthscale, which no
     diagonal system has exactly. This pair sits at -a +- i split a; its normalised covariance
-    differs from exp(-a tau) (1 + a tau) by less than split^2.
+    differs from exp(-a tau) (1 + a tau) by less than split^2 + 1e-15/split^2, the second part
+    being rounding: 1e-4 is near the best.
 
     Args:
         lengthscale: l [s]. sd: standard deviation of the process [output].
-        split: imaginary part of the poles relative to a; smaller is nearer to the limit, but
-            the gains grow as 1/split.
+        split: imaginary part of the poles relative to a; the gains grow as 1/split.
 
     Returns:
-        The system with noise gain sqrt(12 sqrt(3)/l^3) sd. (Example 1 prints sqrt(36/l^3),
-        with which the variance is sqrt(3) sd^2.)
+        White noise of intensity 12 sqrt(3)/l^3 sd^2 through 1/(s + a)^2, nearly. (Example 1 prints
+        36/l^3, with which the variance is sqrt(3) sd^2.)
     """
     a = 3.0**0.5 / lengthscale
     omega = split * a

@@ -74,8 +74,9 @@ def sample_poles(name: str, pairs: int, time_scale: TimeScale, priors: PriorName
     """Sample P poles (*b, P) [1/s].
 
     Sites: ``<name>.log_decay`` and ``<name>.log_frequency`` (P,), logarithms of -Re lambda and of
-    Im lambda over the typical rate of the record. Default: uniform between the rates 1/duration and pi/step (for frequencies
-    from a tenth of the slowest rate, which is as good as a real pole). Paper: flat.
+    Im lambda over the typical rate of the record. Default: uniform between the rates 1/duration
+    and pi/step (for frequencies from a tenth of the slowest rate, which is as good as a real pole).
+    Paper: flat.
     """
     low, high = time_scale.rate_bounds
     if high <= low:

@@ -18,9 +18,7 @@ def identify(seed: int, **options: object) -> dict[str, float]:
     """Fit on t < 15 s, forecast the rest; figures of one seed."""
     data = dgp.datasets.load("lti", seed=seed)
     begin = time.perf_counter()
-    fit = dgp.fit(
-        dgp.LinearDynamicGP(inputs=2, pairs=10), data.train, progress=False, **options
-    )
+    fit = dgp.fit(dgp.LinearDynamicGP(inputs=2, pairs=10), data.train, progress=False, **options)
     spent = time.perf_counter() - begin
     clean = np.asarray(data.truth.clean_test).reshape(-1, 1)
     floor = float(np.sqrt(np.mean((data.test.outputs - clean)[SKIP:] ** 2)))

@@ -82,7 +82,7 @@ class TestMap:
             dgp.Modes([-2.0 + 0.5j], [[3.0]], [1.0], [[0.1]]), 0.3, n=120, seed=9
         )
         model = dgp.LinearDynamicGP(inputs=1, pairs=1)
-        options = {"method": "svi", "starts": 2, "steps": 300, "draws": 40}
+        options = {"method": "svi", "starts": 2, "steps": 60, "draws": 40}
         second = dgp.fit(model, other, workers=1, progress=False, **options)
         again = dgp.fit(model, record[:160], workers=1, progress=False, **options)
         assert same(again, svi_fit)
@@ -145,21 +145,19 @@ def test_nuts_one_pair_of_300_samples(one_pair):
     record = simulate_record(one_pair, 0.1, n=300, seed=2)
     model = dgp.LinearDynamicGP(inputs=1, pairs=1)
     options = {"starts": 2, "progress": False}
-    nuts = dgp.fit(
-        model, record, method="nuts", chains=4, draws=400, warmup=250, seed=1, **options
-    )
+    nuts = dgp.fit(model, record, method="nuts", chains=4, draws=300, warmup=150, seed=1, **options)
     r_hat = {k: v for k, v in nuts.diagnostics.items() if k.startswith("r_hat")}
     assert len(r_hat) == 8
     assert max(r_hat.values()) < 1.01, r_hat
     assert nuts.diagnostics["divergences"] <= 2
-    assert nuts.draws["noise_sd"].shape == (1600, 1)
-    svi = dgp.fit(model, record, method="svi", draws=400, workers=1, **options)
+    assert nuts.draws["noise_sd"].shape == (1200, 1)
+    svi = dgp.fit(model, record, method="svi", steps=400, draws=400, workers=1, **options)
     for name in ("g.log_decay", "g.log_frequency", "g.input_gain", "noise_sd"):
         exact, approximate = nuts.draws[name], svi.draws[name]
         shift = (approximate.mean(0) - exact.mean(0)).abs() / exact.std(0)
         assert float(shift.max()) < 0.35, name
         ratio = approximate.std(0) / exact.std(0)
-        assert 0.6 < float(ratio.min()), name
+        assert float(ratio.min()) > 0.6, name
         assert float(ratio.max()) < 1.5, name
 
 
@@ -183,7 +181,7 @@ def test_bad_records():
     model = dgp.LinearDynamicGP(inputs=1, pairs=1)
     with pytest.raises(ValueError, match="constant"):
         dgp.fit(model, dgp.Record(time=time, inputs=u, outputs=np.ones(20)), progress=False)
-    with pytest.raises(ValueError, match="outputs"):
+    with pytest.raises(ValueError, match="missing samples alone"):
         dgp.fit(model, dgp.Record(time=time, inputs=u, outputs=np.full(20, np.nan)))
     with pytest.raises(ValueError, match="expected 1 inputs"):
         dgp.fit(model, dgp.Record(time=time, outputs=u), progress=False)

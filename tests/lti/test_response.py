@@ -9,8 +9,10 @@ from mpmath import mp
 from scipy.linalg import expm
 from scipy.signal import cont2discrete, dlsim, lfilter
 
+from pyro_dynogp.lti.covariance import complex_expm1
+from pyro_dynogp.lti.fused import propagators
 from pyro_dynogp.lti.modes import Modes
-from pyro_dynogp.lti.response import complex_expm1, held_states, hold, mean_response, propagators
+from pyro_dynogp.lti.response import held_states, hold, mean_response
 from tests.lti import oracles
 from tests.lti.oracles import assert_close, few, random_system, tensor
 

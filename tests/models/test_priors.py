@@ -18,7 +18,6 @@ from pyro_dynogp.models.priors import (
     unit_direction,
 )
 
-
 TYPICAL = TimeScale(1.0, 1000.0).typical_rate  # of the default time scale
 
 
@@ -33,9 +32,9 @@ def test_residues_are_the_partial_fractions_of_the_section():
     B = residues(poles, b)
     s = torch.tensor([0.0 + 0.7j, 0.3 + 2.0j], dtype=torch.complex128)
     for j in range(4):
-        section = (b[j, :, 0] * s[:, None] + b[j, :, 1]) / (
-            (s - poles[j]) * (s - poles[j].conj())
-        )[:, None]
+        section = (b[j, :, 0] * s[:, None] + b[j, :, 1]) / ((s - poles[j]) * (s - poles[j].conj()))[
+            :, None
+        ]
         fractions = B[j] / (s - poles[j])[:, None] + B[j].conj() / (s - poles[j].conj())[:, None]
         torch.testing.assert_close(fractions, section, rtol=1e-12, atol=0)
 

@@ -46,9 +46,7 @@ def test_simulation_is_the_prior(case):
     mean, S, noise = dense(fit, record)
     simulated = fit.simulate(record)
     np.testing.assert_allclose(simulated.mean.reshape(-1), mean, rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(
-        simulated.variance.reshape(-1), np.diag(S) + noise, rtol=1e-9
-    )
+    np.testing.assert_allclose(simulated.variance.reshape(-1), np.diag(S) + noise, rtol=1e-9)
 
 
 @pytest.mark.parametrize("horizon", [1, 4])
@@ -64,9 +62,7 @@ def test_predictions_are_conditional_means(case, horizon):
         m, C = given(mean, S, noise, y, past)
         at = slice(k * n_y, (k + 1) * n_y)
         np.testing.assert_allclose(predicted.mean[k], m[at], rtol=1e-8, atol=1e-10)
-        np.testing.assert_allclose(
-            predicted.variance[k], np.diag(C)[at] + noise[at], rtol=1e-8
-        )
+        np.testing.assert_allclose(predicted.variance[k], np.diag(C)[at] + noise[at], rtol=1e-8)
 
 
 def test_forecast_is_the_conditional_of_the_joined_record(case):
@@ -77,9 +73,7 @@ def test_forecast_is_the_conditional_of_the_joined_record(case):
     past, future = record.split(45)
     m, C = given(mean, S, noise, y, np.arange(len(y)) < 45 * n_y)
     forecast = fit.forecast(past, future)
-    np.testing.assert_allclose(
-        forecast.mean.reshape(-1), m[45 * n_y :], rtol=1e-8, atol=1e-10
-    )
+    np.testing.assert_allclose(forecast.mean.reshape(-1), m[45 * n_y :], rtol=1e-8, atol=1e-10)
     np.testing.assert_allclose(
         forecast.variance.reshape(-1), (np.diag(C) + noise)[45 * n_y :], rtol=1e-8
     )
@@ -161,9 +155,7 @@ def test_samples_have_the_moments_of_the_mixture(name, request, record):
         assert samples.shape == (4000, 80, 1)
         z = (samples.mean(0) - prediction.mean) / (prediction.sd / np.sqrt(4000))
         assert np.abs(z).max() < 5
-        np.testing.assert_allclose(
-            samples.std(0), prediction.sd, rtol=8 * np.sqrt(0.5 / 4000)
-        )
+        np.testing.assert_allclose(samples.std(0), prediction.sd, rtol=8 * np.sqrt(0.5 / 4000))
 
 
 def test_same_seed_same_samples(map_fit, record):
@@ -229,9 +221,7 @@ def test_wrong_uses(map_fit, record, two_outputs):
 def test_future_without_outputs_is_enough(map_fit, record):
     past, future = record.split(160)
     blank = dgp.Record(time=future.time, inputs=future.inputs)
-    assert np.array_equal(
-        map_fit.forecast(past, blank).mean, map_fit.forecast(past, future).mean
-    )
+    assert np.array_equal(map_fit.forecast(past, blank).mean, map_fit.forecast(past, future).mean)
 
 
 def test_no_gradient_and_no_site_is_left_in_a_prediction(map_fit, record):

@@ -38,9 +38,7 @@ def test_moments_and_quantiles_against_sampling_of_the_mixture():
 
 def test_single_component_is_the_normal():
     p = mixture(draws=1)
-    np.testing.assert_allclose(
-        p.quantile(0.9), stats.norm.ppf(0.9, p.mean, p.sd), rtol=1e-12
-    )
+    np.testing.assert_allclose(p.quantile(0.9), stats.norm.ppf(0.9, p.mean, p.sd), rtol=1e-12)
     y = p.mean + 0.3
     np.testing.assert_allclose(p.log_density(y), stats.norm.logpdf(y, p.mean, p.sd), rtol=1e-12)
     np.testing.assert_allclose(p.probability_integral(y), stats.norm.cdf(y, p.mean, p.sd))
