@@ -113,8 +113,6 @@ def record_for(fitted: Fit, data: str, clock: dict[str, Any]) -> tuple[Record, b
         fitted: the fit, in whose units the columns of a file are taken to be.
         data: file or name of a data set. clock: options of `Record.from_csv` about time.
     """
-    import numpy as np
-
     from pyro_dynogp._text_table import read_table
 
     scaling = fitted.scaling
@@ -132,10 +130,6 @@ def record_for(fitted: Fit, data: str, clock: dict[str, Any]) -> tuple[Record, b
         input_units=scaling.input_units,
         output_units=scaling.output_units if measured else (),
     )
-    if not measured:
-        # Outputs that nobody measured: missing samples, with the names of the training record.
-        nothing = np.full((len(record), len(scaling.output_names)), np.nan)
-        record = record.with_outputs(nothing, scaling.output_names, scaling.output_units)
     return record, measured
 
 

@@ -234,7 +234,8 @@ class Modes:
             raise invalid("Modes", expected="batch dimensions to index", got="none")
         numbers = torch.arange(self.batch_shape.numel()).reshape(self.batch_shape)[index]
         full = self.expand(self.batch_shape)
-        return full._map(lambda x, k: x.reshape((-1, *x.shape[x.dim() - k :]))[numbers])
+        count = self.batch_shape.numel()
+        return full._map(lambda x, k: x.reshape((count, *x.shape[x.dim() - k :]))[numbers])
 
     def detach(self) -> Modes:
         """The same values without gradient history."""

@@ -25,18 +25,13 @@ if TYPE_CHECKING:
 
 def prior_process(fit: Fit, record: Record, *, process_noise: bool = True) -> LTIProcess:
     """Noise-free trajectories along a record, one batch element for each draw."""
-    state: Tensor | None = None
-    if fit.model.initial_state == "site":
+    model, system = fit.model, fit.system
+    state = None
+    if model.initial_state == "site":
         # The site belongs to the training record; elsewhere the state is unknown again.
-        modes = fit.system.modes if process_noise else fit.system.modes.without_process_noise()
-        return fit.model.process(
-            fit.system,
-            record,
-            fit.scaling,
-            fit.model.prior_state(fit.system, modes),
-            process_noise=process_noise,
-        )
-    return fit.model.process(fit.system, record, fit.scaling, state, process_noise=process_noise)
+        modes = system.modes if process_noise else system.modes.without_process_noise()
+        state = model.prior_state(system, modes)
+    return model.process(system, record, fit.scaling, state, process_noise=process_noise)
 
 
 def simulate(fit: Fit, record: Record, process_noise: bool, samples: int, seed: int) -> Prediction:
@@ -116,7 +111,7 @@ def predict(fit: Fit, record: Record, horizon: int, samples: int, seed: int) -> 
         return mean_[which] + sd[which] * generator.standard_normal((samples, *mean_.shape[1:]))
 
     kind = f"{horizon}-step prediction"
-    return _prediction(record, mean_, variance_, noise, parts, draw, kind)
+    return _prediction(fit, record, mean_, variance_, noise, parts, draw, kind)
 
 
 def _of_process(
@@ -144,10 +139,11 @@ def _of_process(
             y = process.observed(fit.system.noise_sd).sample((each,))
             return _outputs(fit, y.flatten(0, 1))[:samples]
 
-    return _prediction(record, mean, variance, noise, parts, draw, kind)
+    return _prediction(fit, record, mean, variance, noise, parts, draw, kind)
 
 
 def _prediction(
+    fit: Fit,
     record: Record,
     mean: np.ndarray,
     variance: np.ndarray,
@@ -156,7 +152,7 @@ def _prediction(
     draw: Callable[[], np.ndarray],
     kind: str,
 ) -> Prediction:
-    names = record.output_names or tuple(f"y{a}" for a in range(mean.shape[-1]))
+    names = fit.scaling.output_names
     return Prediction(record.time, names, mean, variance, noise, parts, draw, kind)
 
 

@@ -89,6 +89,17 @@ class TestMap:
         assert not same(again, second)
 
 
+def test_scaling_is_learnt_from_the_training_record_alone(map_fit, record):
+    """The paper's electricity run standardises with the test period too; ours must not."""
+    train = record[:160]
+    assert map_fit.scaling.output_offset[0] == train.outputs.mean()
+    assert map_fit.scaling.output_scale[0] == train.outputs.std()
+    assert abs(record.outputs.mean() - train.outputs.mean()) > 1e-3  # the printed way differs
+    before = map_fit.scaling
+    map_fit.forecast(train, record[160:])
+    assert map_fit.scaling == before
+
+
 class TestSeveralRecords:
     def test_more_records_pin_the_pole_down(self, one_pair):
         records = [simulate_record(one_pair, 0.1, n=150, seed=s) for s in range(3)]
