@@ -119,7 +119,7 @@ def test_fit_without_inputs_on_time_stamps(folder, tmp_path):
         "--timezone", "Europe/Vienna", *QUICK, "--figures", tmp_path / "new" / "figures",
     )  # fmt: skip
     assert result.exit_code == 0, result.output
-    assert "0 inputs" in result.stdout
+    assert "inputs=0" in result.stdout
     assert "5 figures in" in result.stdout
     assert not (tmp_path / "new" / "figures" / "bode.png").exists()
 

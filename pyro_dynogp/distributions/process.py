@@ -61,7 +61,7 @@ class LTIProcess(Trajectory):
         validate_args: bool | None = None,
     ) -> None:
         self.modes = modes
-        self.grid = time_grid(time)
+        self.grid = time_grid(time).to(modes.poles.device)
         self.inputs = as_inputs(modes, self.grid, inputs)
         if initial_state is not None and not isinstance(initial_state, ModalState):
             x0 = as_tensor(initial_state, torch.complex128, modes.poles.device)
@@ -69,6 +69,8 @@ class LTIProcess(Trajectory):
         self.initial_state: ModalState | None = initial_state
         if initial_state is not None:
             _check_state(initial_state, modes.pairs)
+        if not jitter >= 0:
+            raise invalid("jitter", expected="a number >= 0", got=repr(jitter))
         self.jitter = jitter
         shapes = [modes.batch_shape, self.inputs.shape[:-2]]
         if initial_state is not None:

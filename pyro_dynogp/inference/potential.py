@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.distributions import biject_to
 from torch.distributions.transforms import Transform
 
+from pyro_dynogp._errors import invalid
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
 
 
@@ -33,6 +34,9 @@ class Potential:
     Args:
         model: a Pyro function. args: what it is called with.
         values: a value for every latent site, at which the model is traced once.
+
+    Raises:
+        ValueError: where a latent site has no value.
     """
 
     def __init__(
@@ -42,6 +46,15 @@ class Potential:
         trace = pyro.poutine.trace(pyro.poutine.condition(model, data=dict(values))).get_trace(
             *args
         )
+        unset = [
+            name
+            for name, node in trace.nodes.items()
+            if node["type"] == "sample" and not node["is_observed"]
+        ]
+        if unset:
+            raise invalid(
+                "values", expected=f"a value for every latent site, {unset} too", got="none"
+            )
         self.sites: list[Site] = []
         for name, node in trace.nodes.items():
             if node["type"] == "sample" and name in values:

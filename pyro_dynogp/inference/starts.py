@@ -71,8 +71,8 @@ def _given_poles(
     residues = (gains[..., 0] + 1j * gains[..., 1]) * rate[:, None]  # c_aj B_jm
     unit_rate = TimeScale(float(scaling.time_step), float(scaling.duration)).typical_rate
     values: dict[str, Any] = {
-        "g.log_decay": np.log(-poles.real / unit_rate),
-        "g.log_frequency": np.log(poles.imag / unit_rate),
+        "g_log_decay": np.log(-poles.real / unit_rate),
+        "g_log_frequency": np.log(poles.imag / unit_rate),
         "offset": weights[:, -1],
         "noise_sd": 0.7 * spread + 1e-3,
     }
@@ -86,23 +86,23 @@ def _given_poles(
                 left, size, right = np.linalg.svd(residues[:, j, :], full_matrices=False)
                 turn = np.exp(-1j * np.angle(left[0, 0]))
                 direction[:, j], B[j] = left[:, 0] * turn, size[0] * right[0] / turn
-        values["g.output_gain"] = np.stack([direction.real, direction.imag], -1)
+        values["g_output_gain"] = np.stack([direction.real, direction.imag], -1)
     if n_u:
         # From residues to sections: b1 = g1 |lambda|, b0 = g0 |lambda|^2.
         section = numerators(torch.as_tensor(poles), torch.as_tensor(B)).numpy()
         section = section / np.stack([rate, rate**2], -1)[:, None, :]
-        values["g.input_gain"] = np.clip(section, -10.0, 10.0)
+        values["g_input_gain"] = np.clip(section, -10.0, 10.0)
         if model.feedthrough:
             D = weights[:, 2 * P * n_u : -1]
-            values["g.feedthrough"] = D if model.several_outputs else D[0]
+            values["g_feedthrough"] = D if model.several_outputs else D[0]
     if model.process_noise:
         brownian = model.brownian or n_y
         share = 0.3 * float(spread.mean()) / math.sqrt(P * brownian)
-        values["g.noise_gain.local_scale"] = np.full(P, math.sqrt(share / HORSESHOE_SCALE))
+        values["g_noise_gain_local_scale"] = np.full(P, math.sqrt(share / HORSESHOE_SCALE))
         unit = np.full((P, brownian, 2), math.sqrt(0.5 * share / HORSESHOE_SCALE))
-        values["g.noise_gain.unit"] = unit
+        values["g_noise_gain_unit"] = unit
     if model.initial_state == "site":
-        suffixes = [""] if len(records) == 1 else [f".{i}" for i in range(len(records))]
+        suffixes = [""] if len(records) == 1 else [f"_{i}" for i in range(len(records))]
         for suffix in suffixes:
             values[f"initial_state{suffix}"] = np.zeros(2 * P)
     tensors = {name: torch.tensor(value, dtype=torch.float64) for name, value in values.items()}

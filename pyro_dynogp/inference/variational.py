@@ -100,16 +100,9 @@ def variational(
                 elif step - best_step >= 200:
                     message = "the ELBO no longer rises"
                     break
-        names = [name for name, _, _ in _sites_of(guide)]
+        names = list(guide._unconstrained_shapes)
         if names != order:
             raise RuntimeError(f"The guide orders the sites {names}, the potential {order}.")
         posterior = guide.get_posterior()
         fitted = gaussian_guide(potential, posterior.loc, posterior.scale_tril)
     return VariationalPosterior(fitted, np.asarray(elbo), message)
-
-
-def _sites_of(guide: AutoMultivariateNormal) -> list[tuple[str, Any, Any]]:
-    return [
-        (name, shape, guide.prototype_trace.nodes[name]["fn"])
-        for name, shape in guide._unconstrained_shapes.items()
-    ]

@@ -24,7 +24,11 @@ def _transpose(x: np.ndarray) -> np.ndarray:
 def _covariances(
     shared: bool, lam: np.ndarray, C: np.ndarray, L: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """Denominators, numerators and values of E[xi xi^H], E[xi xi^T], and q = E[xi y]."""
+    """Denominators, numerators and values of E[xi xi^H], E[xi xi^T], and q = E[xi y].
+
+    Out of floating-point range they are infinite or NaN, as torch would have it: the factorisation
+    refuses them.
+    """
     sums = (lam[:, :, None] + lam.conj()[:, None, :], lam[:, :, None] + lam[:, None, :])
     products = [L @ _transpose(L.conj()), L @ _transpose(L)]
     if not shared:
@@ -41,7 +45,8 @@ class _OutputRows(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, shared: bool, *args: Tensor) -> Any:  # poles (b, P), C, L
         lam, C, L = (array(a) for a in args)
-        q = _covariances(shared, lam, C, L)[-1]
+        with np.errstate(all="ignore"):
+            q = _covariances(shared, lam, C, L)[-1]
         ctx.save_for_backward(*args)
         ctx.shared = shared
         h = np.concatenate([2.0 * C.real, -2.0 * C.imag], -1)

@@ -33,6 +33,12 @@ class TimeGrid:
     def __len__(self) -> int:
         return int(self.time.shape[0])
 
+    def to(self, device: torch.device) -> TimeGrid:
+        """The same grid with its tensors on a device."""
+        if self.time.device == device:
+            return self
+        return TimeGrid(self.time.to(device), self.steps.to(device), self.step_index)
+
     def rows(self, outputs: int) -> tuple[np.ndarray, np.ndarray]:
         """Step index and output index of the n * n_y rows, the outputs of one time together."""
         step = np.full((len(self), outputs), -1, dtype=np.int64)

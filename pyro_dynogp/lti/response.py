@@ -152,8 +152,8 @@ def mean_response(
     Raises:
         ValueError: where the shape of inputs or initial_state does not fit the system.
     """
-    grid = time_grid(time)
     device = modes.poles.device
+    grid = time_grid(time).to(device)
     u = as_inputs(modes, grid, inputs)
     x0 = (
         torch.zeros(modes.pairs, dtype=torch.complex128, device=device)

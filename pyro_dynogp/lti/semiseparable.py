@@ -56,7 +56,7 @@ class SemiseparableCovariance:
         initial_covariance: Tensor | None = None,
     ) -> None:
         self.modes = modes
-        self.grid = time_grid(time)
+        self.grid = time_grid(time).to(modes.poles.device)
         self.size = len(self.grid) * modes.outputs
         v = as_tensor(noise_variance, device=modes.poles.device)
         if v.dim() == 0:

@@ -48,7 +48,7 @@ class LinearDynamicGP:
 
     The trajectory is integrated out, so that the observed site ``y`` carries the exact marginal
     likelihood. Calling the model with a record runs the Pyro model; with a sequence of records
-    they share every hyperparameter (sites ``y.0``, ``y.1``, ...). A record without outputs leaves
+    they share every hyperparameter (sites ``y_0``, ``y_1``, ...). A record without outputs leaves
     ``y`` unobserved, to be sampled.
 
     Sites: those of `sample_modes` under the prefix ``g``, ``offset`` and ``noise_sd`` (n_y,) in
@@ -207,7 +207,7 @@ class LinearDynamicGP:
         scaling = self.scaling or Scaling.from_records(records)
         system = self.sample_system(scaling)
         for index, record in enumerate(checked):
-            suffix = "" if single else f".{index}"
+            suffix = "" if single else f"_{index}"
             state: Any = None
             if self.initial_state == "site":
                 one = torch.ones(2 * self.pairs, dtype=torch.float64)

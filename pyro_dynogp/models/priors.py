@@ -73,7 +73,7 @@ def _complex(x: Tensor) -> Tensor:
 def sample_poles(name: str, pairs: int, time_scale: TimeScale, priors: PriorName) -> Tensor:
     """Sample P poles (*b, P) [1/s].
 
-    Sites: ``<name>.log_decay`` and ``<name>.log_frequency`` (P,), logarithms of -Re lambda and of
+    Sites: ``<name>_log_decay`` and ``<name>_log_frequency`` (P,), logarithms of -Re lambda and of
     Im lambda over the typical rate of the record. Default: uniform between the rates 1/duration
     and pi/step (for frequencies from a tenth of the slowest rate, which is as good as a real pole).
     Paper: flat.
@@ -83,8 +83,8 @@ def sample_poles(name: str, pairs: int, time_scale: TimeScale, priors: PriorName
         raise invalid("time_scale", expected="more than three samples", got=repr(time_scale))
     if priors == "paper":
         flat = _normal(FLAT, pairs)
-        log_decay = pyro.sample(f"{name}.log_decay", flat)
-        log_frequency = pyro.sample(f"{name}.log_frequency", flat)
+        log_decay = pyro.sample(f"{name}_log_decay", flat)
+        log_frequency = pyro.sample(f"{name}_log_frequency", flat)
     else:
         half = 0.5 * (high - low)
         top = torch.full((pairs,), half, dtype=torch.float64)
@@ -92,8 +92,8 @@ def sample_poles(name: str, pairs: int, time_scale: TimeScale, priors: PriorName
         def uniform(bottom: float) -> dist.Distribution:
             return dist.Uniform(torch.full_like(top, bottom), top).to_event(1)
 
-        log_decay = pyro.sample(f"{name}.log_decay", uniform(-half))
-        log_frequency = pyro.sample(f"{name}.log_frequency", uniform(-half - math.log(10.0)))
+        log_decay = pyro.sample(f"{name}_log_decay", uniform(-half))
+        log_frequency = pyro.sample(f"{name}_log_frequency", uniform(-half - math.log(10.0)))
     decay = time_scale.typical_rate * log_decay.exp()
     undamped = time_scale.typical_rate * log_frequency.exp()
     # The floor is as good as a double real pole (relative error 4e-4) and keeps residues bounded.
@@ -127,15 +127,15 @@ def sample_horseshoe(
 ) -> Tensor:
     """Horseshoe of the given scale over rows: scale * local * z (*b, *shape).
 
-    Hierarchical and non-centred (Carvalho, Polson & Scott 2009): sites ``<name>.local_scale``
-    (shape[0],) half-Cauchy(1) and ``<name>.unit`` standard normal, or half-normal if `positive`.
+    Hierarchical and non-centred (Carvalho, Polson & Scott 2009): sites ``<name>_local_scale``
+    (shape[0],) half-Cauchy(1) and ``<name>_unit`` standard normal, or half-normal if `positive`.
     Its density is proper, unlike the horseshoe density itself, whose mode at zero is infinite.
     """
     one = torch.ones(shape[:1], dtype=torch.float64)
-    local = pyro.sample(f"{name}.local_scale", dist.HalfCauchy(one).to_event(1))
+    local = pyro.sample(f"{name}_local_scale", dist.HalfCauchy(one).to_event(1))
     ones = torch.ones(shape, dtype=torch.float64)
     prior = dist.HalfNormal(ones) if positive else dist.Normal(0.0 * ones, ones)
-    unit = pyro.sample(f"{name}.unit", prior.to_event(len(shape)))
+    unit = pyro.sample(f"{name}_unit", prior.to_event(len(shape)))
     return scale * local.reshape(local.shape + (1,) * (len(shape) - 1)) * unit
 
 
@@ -154,12 +154,12 @@ def sample_modes(
 ) -> Modes:
     """Sample a stochastic LTI system, for inputs and outputs of unit standard deviation.
 
-    Sites (all start with ``<name>.``), * marking what depends on the options:
+    Sites (all start with ``<name>_``), * marking what depends on the options:
 
     - ``log_decay``, ``log_frequency`` (P,): see `sample_poles`.
     - ``input_gain`` (P, n_u, 2)*: g1 and g0 of each section (output per input), normal(0, 3).
     - ``output_gain`` (n_y, P, 2)*: direction of c, only for several outputs; normal(0, 1).
-    - ``noise_gain.local_scale`` (P,), ``noise_gain.unit`` (P, n_l, 2)*: horseshoe of scale 0.1 on
+    - ``noise_gain_local_scale`` (P,), ``noise_gain_unit`` (P, n_l, 2)*: horseshoe of scale 0.1 on
       n1 and n0 of the noise's sections (n1 s + n0 |lambda|) sqrt(4 r) / (...), r the typical rate
       of the record: the standard deviation of the output of a pair that decays at that rate. The
       prior is on the intensity of the noise (as the paper's), so that a pair so fast that it would
@@ -189,21 +189,21 @@ def sample_modes(
     flat = priors == "paper"
     B = L = D = None
     if inputs:
-        gain = pyro.sample(f"{name}.input_gain", _normal(FLAT if flat else 3.0, pairs, inputs, 2))
+        gain = pyro.sample(f"{name}_input_gain", _normal(FLAT if flat else 3.0, pairs, inputs, 2))
         B = residues(poles, _section(poles, gain) * poles.abs()[..., None, None])
         if feedthrough:
             shape = (inputs,) if outputs is None else (outputs, inputs)
-            D = pyro.sample(f"{name}.feedthrough", _normal(FLAT if flat else 1.0, *shape))
+            D = pyro.sample(f"{name}_feedthrough", _normal(FLAT if flat else 1.0, *shape))
     if process_noise:
         # The sign of a Brownian motion, and of a zero, cannot be seen in a covariance.
         alone = outputs is None and brownian == 1 and (pairs == 1 or noise == "independent")
-        share = sample_horseshoe(f"{name}.noise_gain", pairs, brownian, 2, positive=alone)
+        share = sample_horseshoe(f"{name}_noise_gain", pairs, brownian, 2, positive=alone)
         L = residues(poles, _section(poles, share) * math.sqrt(4.0 * scale.typical_rate))
     if outputs is None:
         c = torch.ones(pairs, dtype=torch.complex128)
         c = c.expand(poles.shape)
     else:
-        raw = _complex(pyro.sample(f"{name}.output_gain", _normal(1.0, outputs, pairs, 2)))
+        raw = _complex(pyro.sample(f"{name}_output_gain", _normal(1.0, outputs, pairs, 2)))
         c = unit_direction(raw)
     return Modes(poles=poles, input_gain=B, output_gain=c, noise_gain=L, feedthrough=D, noise=noise)
 

@@ -143,8 +143,8 @@ class TestVariational:
         assert 0.0 < evidence - elbo < 1.0
 
     def test_posterior_is_about_the_mode(self, svi_fit, map_fit):
-        decay = svi_fit.draws["g.log_decay"]
-        assert abs(float(decay.mean() - map_fit.mode["g.log_decay"])) < 3 * float(decay.std())
+        decay = svi_fit.draws["g_log_decay"]
+        assert abs(float(decay.mean() - map_fit.mode["g_log_decay"])) < 3 * float(decay.std())
         assert svi_fit.system.modes.batch_shape == (40,)
 
     def test_history_is_the_elbo(self, svi_fit):
@@ -163,7 +163,7 @@ def test_nuts_one_pair_of_300_samples(one_pair):
     assert nuts.diagnostics["divergences"] <= 2
     assert nuts.draws["noise_sd"].shape == (1200, 1)
     svi = dgp.fit(model, record, method="svi", steps=400, draws=400, workers=1, **options)
-    for name in ("g.log_decay", "g.log_frequency", "g.input_gain", "noise_sd"):
+    for name in ("g_log_decay", "g_log_frequency", "g_input_gain", "noise_sd"):
         exact, approximate = nuts.draws[name], svi.draws[name]
         shift = (approximate.mean(0) - exact.mean(0)).abs() / exact.std(0)
         assert float(shift.max()) < 0.35, name

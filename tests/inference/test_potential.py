@@ -83,3 +83,12 @@ def test_out_of_range_is_a_wall_not_a_crash(potential):
     energy, gradient = function.value_and_gradient(z)
     assert energy == 1e15
     assert not gradient.any()
+
+
+def test_every_latent_site_needs_a_value():
+    def model():
+        pyro.sample("x", dist.Normal(0.0, 1.0))
+        pyro.sample("z", dist.Normal(0.0, 1.0))
+
+    with pytest.raises(ValueError, match=r"values: expected a value for every latent site.*'z'"):
+        Potential(model, (), {"x": torch.tensor(0.0)})

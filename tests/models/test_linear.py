@@ -55,12 +55,12 @@ def test_dependencies_are_what_the_model_says(record):
     relations = get_model_relations(dgp.LinearDynamicGP(inputs=1, pairs=2), (record,))
     parents = set(relations["sample_sample"]["y"])
     assert parents == {
-        "g.log_decay",
-        "g.log_frequency",
-        "g.input_gain",
-        "g.feedthrough",
-        "g.noise_gain.local_scale",
-        "g.noise_gain.unit",
+        "g_log_decay",
+        "g_log_frequency",
+        "g_input_gain",
+        "g_feedthrough",
+        "g_noise_gain_local_scale",
+        "g_noise_gain_unit",
         "offset",
         "noise_sd",
     }
@@ -154,12 +154,12 @@ def test_several_records_share_their_parameters(record):
     scaled = model.scaled_to(parts)
     trace = draw(scaled, parts)
     trace.compute_log_prob()
-    assert {"y.0", "y.1"} <= set(trace.nodes)
+    assert {"y_0", "y_1"} <= set(trace.nodes)
     values = latent(trace)
     for index, part in enumerate(parts):
         alone = pyro.poutine.trace(pyro.poutine.condition(scaled, data=values)).get_trace(part)
         alone.compute_log_prob()
-        assert float(trace.nodes[f"y.{index}"]["log_prob_sum"]) == pytest.approx(
+        assert float(trace.nodes[f"y_{index}"]["log_prob_sum"]) == pytest.approx(
             float(alone.nodes["y"]["log_prob_sum"]), rel=1e-12
         )
 

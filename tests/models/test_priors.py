@@ -47,7 +47,7 @@ def test_numerators_invert_residues():
 
 def test_second_gain_is_the_steady_state_gain():
     gain = torch.tensor([[[0.4, 1.7]]], dtype=torch.float64)
-    with pyro.poutine.condition(data={"g.input_gain": gain, "g.feedthrough": torch.zeros(1)}):
+    with pyro.poutine.condition(data={"g_input_gain": gain, "g_feedthrough": torch.zeros(1)}):
         modes = sample_modes("g", inputs=1, pairs=1)
     assert float(steady_state_gain(modes)) == pytest.approx(1.7, rel=1e-10)
 
@@ -55,10 +55,10 @@ def test_second_gain_is_the_steady_state_gain():
 def test_nearly_double_poles_keep_accuracy():
     # The lowest frequency that the prior allows: residues are 50 times the gains, not more.
     values = {
-        "g.log_decay": torch.tensor([0.3 - math.log(TYPICAL)], dtype=torch.float64),
-        "g.log_frequency": torch.tensor([-9.0], dtype=torch.float64),
-        "g.input_gain": torch.tensor([[[0.0, 1.0]]], dtype=torch.float64),
-        "g.feedthrough": torch.zeros(1).double(),
+        "g_log_decay": torch.tensor([0.3 - math.log(TYPICAL)], dtype=torch.float64),
+        "g_log_frequency": torch.tensor([-9.0], dtype=torch.float64),
+        "g_input_gain": torch.tensor([[[0.0, 1.0]]], dtype=torch.float64),
+        "g_feedthrough": torch.zeros(1).double(),
     }
     with pyro.poutine.condition(data=values):
         modes = sample_modes("g", inputs=1, pairs=1)
@@ -117,7 +117,7 @@ def test_signs_of_noise_zeros_are_fixed_only_where_they_cannot_be_seen():
     def support(**options):
         with pyro.poutine.trace() as tracer:
             sample_modes("g", inputs=0, **options)
-        return type(tracer.trace.nodes["g.noise_gain.unit"]["fn"].base_dist).__name__
+        return type(tracer.trace.nodes["g_noise_gain_unit"]["fn"].base_dist).__name__
 
     assert support(pairs=1) == "HalfNormal"
     assert support(pairs=3, noise="independent") == "HalfNormal"

@@ -1,0 +1,64 @@
+"""The README's code does what it says."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pyro
+import torch
+from pyro.infer import SVI, Trace_ELBO
+from pyro.infer.autoguide import AutoNormal
+
+import pyro_dynogp as dgp
+from tests.conftest import simulate_record
+
+README = (Path(__file__).parent.parent / "README.md").read_text()
+
+
+def blocks() -> list[str]:
+    return re.findall(r"```python\n(.*?)```", README, flags=re.S)
+
+
+def test_fitting_a_record(tmp_path, monkeypatch, one_pair):
+    monkeypatch.chdir(tmp_path)
+    record = simulate_record(one_pair, 0.1, n=480)
+    np.savetxt(
+        "drives.csv",
+        np.column_stack([record.inputs, record.outputs]),
+        header="u,z",
+        comments="",
+        delimiter=",",
+    )
+    code = blocks()[0].replace("pairs=5", "pairs=1")
+    code = code.replace("train)", "train, starts=1, workers=1, progress=False)", 1)
+    code = code.replace('"svi")', '"svi", starts=1, steps=50, workers=1, progress=False)')
+    names: dict = {}
+    exec(code, names)
+    assert names["fit"].method == "svi"
+    assert len(names["forecast"]) == 80
+    assert (tmp_path / "drives.safetensors").is_file()
+
+
+def test_custom_model_trains(one_pair):
+    names: dict = {}
+    exec(blocks()[1], names)
+    model, record = names["model"], simulate_record(one_pair, 0.1, n=60)
+    pyro.set_rng_seed(0)
+    with pyro.get_param_store().scope():
+        guide = AutoNormal(model)
+        svi = SVI(model, guide, pyro.optim.Adam({"lr": 0.05}), Trace_ELBO())
+        losses = [svi.step(record) for _ in range(150)]
+    assert np.mean(losses[-20:]) < np.mean(losses[:20])
+    trace = pyro.poutine.trace(model).get_trace(record)
+    changed = pyro.poutine.condition(model, data={"g": trace.nodes["g"]["value"] + 1.0})
+    other = pyro.poutine.trace(
+        pyro.poutine.condition(changed, data={"sigma": trace.nodes["sigma"]["value"]})
+    ).get_trace(record)
+    trace.compute_log_prob()
+    other.compute_log_prob()
+    assert not torch.isclose(trace.nodes["y"]["log_prob_sum"], other.nodes["y"]["log_prob_sum"])
+
+
+def test_every_public_name_in_the_readme_exists():
+    for name in set(re.findall(r"\bdgp\.(\w+)", README)):
+        assert hasattr(dgp, name), name
