@@ -15,7 +15,7 @@ import joblib
 import numpy as np
 import torch
 from joblib.parallel import get_active_backend
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from pyro_dynogp._errors import invalid
 

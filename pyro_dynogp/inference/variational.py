@@ -13,7 +13,7 @@ from pyro.infer import SVI, Trace_ELBO
 from pyro.infer.autoguide import AutoMultivariateNormal, init_to_value
 from pyro.optim import ClippedAdam
 from torch import Tensor
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from pyro_dynogp.inference.guides import GaussianGuide, gaussian_guide
 from pyro_dynogp.inference.potential import Potential
