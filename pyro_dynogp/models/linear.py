@@ -64,7 +64,8 @@ class LinearDynamicGP:
         initial_state: "integrated", what unknown past inputs of one standard deviation and past
             process noise would have left, a Gaussian, integrated out; "zero" (but for the past
             process noise); or "site", sampled.
-        priors: "default", or "paper" for flat ones but for the horseshoe on the noise gains.
+        priors: "default", or "paper" for flat ones but for the horseshoe on the noise gains: fit
+            with them, but do not sample from them, their draws exceed floating-point range.
         scaling: what one time step and one standard deviation are; learnt by `fit` from the
             training record. Without it the record that the model is called with sets them.
 

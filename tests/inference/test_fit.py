@@ -89,6 +89,19 @@ class TestMap:
         assert not same(again, second)
 
 
+@pytest.mark.parametrize("initial_state", ["integrated", "zero", "site"])
+@pytest.mark.parametrize("priors", ["default", "paper"])
+@pytest.mark.parametrize("noise", ["shared", "independent"])
+def test_every_variant_of_the_model_can_be_fitted(record, initial_state, priors, noise):
+    model = dgp.LinearDynamicGP(
+        inputs=1, pairs=2, initial_state=initial_state, priors=priors, noise=noise
+    )
+    fit = dgp.fit(model, record[:160], starts=1, steps=60, workers=1, progress=False)
+    test = dgp.scores(fit.forecast(record[:160], record[160:]), record[160:])
+    assert test["nrmse"] < 0.6
+    assert fit.noise_sd[0] == pytest.approx(0.1, rel=0.5)
+
+
 def test_scaling_is_learnt_from_the_training_record_alone(map_fit, record):
     """The paper's electricity run standardises with the test period too; ours must not."""
     train = record[:160]
