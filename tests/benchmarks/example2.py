@@ -27,14 +27,16 @@ def identify(seed: int, **options: object) -> dict[str, float]:
     simulated = fit.simulate(data.full, process_noise=False)
     start = len(data.train) + SKIP
     error = (simulated.mean - data.full.outputs)[start:]
-    first = np.abs(forecast.mean - clean)[:SKIP].mean()
+    # What carrying the state over is worth: the same time from an unknown state.
+    unknown = fit.simulate(data.test, process_noise=False)
+    early = [np.abs(p.mean - clean)[:SKIP].mean() for p in (forecast, unknown)]
     return {
         "seed": seed,
         "ratio": late["rmse"] / floor,
         "simulation": float(np.sqrt(np.mean(error**2))) / floor,
         "coverage": late["coverage_95"],
         "noise": fit.noise_sd[0] / data.truth.noise_sd,
-        "early": first / np.abs(forecast.mean - clean)[SKIP:].mean(),
+        "early": early[0] / early[1],
         "seconds": spent,
     }
 
@@ -45,10 +47,10 @@ def run(folder: Path) -> str:
     lines = [
         "Paper's Example 2: RMSE over the noise floor for t > 16.5 s; coverage of the 95 % band; "
         "estimated over true measurement noise; error against the clean output in the first 1.5 s "
-        "over that in the rest.",
+        "over that of a simulation that does not know the state.",
         "",
         "| seed | forecast / floor | simulation from t = 0 / floor | coverage | noise sd / true "
-        "| early / late error | fit [s] |",
+        "| early error / unknown state | fit [s] |",
         "|---" * 7 + "|",
     ]
     for row in rows:
