@@ -19,7 +19,7 @@ def test_uniformity_accepts_uniform_and_rejects_skewed_ranks():
     accepted = [uniformity(rng.integers(KEPT + 1, size=200)) for _ in range(200)]
     assert 0.01 < np.mean(np.array(accepted) < 0.05) < 0.11
     overconfident = np.clip(np.round(rng.normal(KEPT / 2, 9, 200)), 0, KEPT).astype(int)
-    assert uniformity(overconfident) < 1e-6
+    assert uniformity(overconfident) < 1e-4
 
 
 def test_ties_are_broken_at_random():

@@ -74,7 +74,7 @@ class TestMap:
         )
         assert torch.equal(torch.rand(3), before)
         assert list(pyro.get_param_store().keys()) == ["mine"]
-        assert float(pyro.param("mine")) == 3.0
+        assert pyro.param("mine").item() == 3.0
         pyro.get_param_store().clear()
 
     def test_two_models_in_one_process_do_not_meet(self, record, one_pair, svi_fit):
