@@ -11,7 +11,7 @@ from torch import Tensor
 
 
 def broadcast(*shapes: Iterable[int]) -> torch.Size:
-    """Broadcast shapes, as torch.broadcast_shapes does at ten times the cost.
+    """Broadcast shapes, as torch.broadcast_shapes does, which is slow for every likelihood.
 
     Raises:
         ValueError: where two sizes differ and neither is one.

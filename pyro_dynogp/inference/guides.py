@@ -11,7 +11,7 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from pyro_dynogp.inference.potential import Potential
+from pyro_dynogp.inference.potential import Potential, parts
 
 
 @dataclass(frozen=True)
@@ -76,10 +76,8 @@ class GaussianGuide:
             dist.MultivariateNormal(self.loc, scale_tril=self.scale_tril),
             infer={"is_auxiliary": True},
         )
-        values, start = {}, 0
-        for site in self.sites:
-            stop = start + site.unconstrained.numel()
-            part = z[..., start:stop].reshape(z.shape[:-1] + site.unconstrained)
+        values = {}
+        for site, part in parts(self.sites, z):
             value = site.transform(part)
             jacobian = site.transform.log_abs_det_jacobian(part, value)
             extra = jacobian.dim() - (z.dim() - 1)
@@ -88,7 +86,6 @@ class GaussianGuide:
                 site.name,
                 dist.Delta(value, log_density=-jacobian, event_dim=len(site.shape)),
             )
-            start = stop
         return values
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,6 +26,15 @@ class Site:
     shape: torch.Size
     unconstrained: torch.Size
     transform: Transform
+
+
+def parts(sites: Sequence[Site], z: Tensor) -> Iterator[tuple[Site, Tensor]]:
+    """Each site with its part (*s, *unconstrained) of the vectors z (*s, d)."""
+    start = 0
+    for site in sites:
+        stop = start + site.unconstrained.numel()
+        yield site, z[..., start:stop].reshape(z.shape[:-1] + site.unconstrained)
+        start = stop
 
 
 class Potential:
@@ -74,14 +83,7 @@ class Potential:
 
     def unpack(self, z: Tensor) -> dict[str, Tensor]:
         """Unconstrained vectors (*s, d) to constrained values (*s, *shape) of every site."""
-        return {site.name: site.transform(part) for site, part in self._parts(z)}
-
-    def _parts(self, z: Tensor) -> Iterator[tuple[Site, Tensor]]:
-        start = 0
-        for site in self.sites:
-            stop = start + site.unconstrained.numel()
-            yield site, z[..., start:stop].reshape(z.shape[:-1] + site.unconstrained)
-            start = stop
+        return {site.name: site.transform(part) for site, part in parts(self.sites, z)}
 
     def log_joint(self, values: Mapping[str, Tensor]) -> Tensor:
         """Log p(y, values), of constrained values."""
@@ -92,7 +94,7 @@ class Potential:
         """-log density at z (d,): of the values, or with `jacobian` of the unconstrained vector."""
         values: dict[str, Tensor] = {}
         log_jacobian: Tensor | float = 0.0
-        for site, part in self._parts(z):
+        for site, part in parts(self.sites, z):
             value = site.transform(part)
             values[site.name] = value
             if jacobian:

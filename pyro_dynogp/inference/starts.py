@@ -46,7 +46,7 @@ def starting_values(
 
 def random_poles(pairs: int, scaling: Scaling, generator: np.random.Generator) -> np.ndarray:
     """Poles (P,) with log-uniform natural frequency and uniform damping ratio, slowest first."""
-    low, high = TimeScale(float(scaling.time_step), float(scaling.duration)).rate_bounds
+    low, high = TimeScale.of(scaling).rate_bounds
     # Not right at the limits: nothing can be learnt there and gradients vanish.
     rate = np.exp(np.sort(generator.uniform(low + 1.0, high - 0.7, pairs)))
     damping = generator.uniform(0.1, 0.95, pairs)
@@ -69,7 +69,7 @@ def _given_poles(
     rate = np.abs(poles)
     gains = weights[:, : 2 * P * n_u].reshape(n_y, P, n_u, 2)
     residues = (gains[..., 0] + 1j * gains[..., 1]) * rate[:, None]  # c_aj B_jm
-    unit_rate = TimeScale(float(scaling.time_step), float(scaling.duration)).typical_rate
+    unit_rate = TimeScale.of(scaling).typical_rate
     values: dict[str, Any] = {
         "g_log_decay": np.log(-poles.real / unit_rate),
         "g_log_frequency": np.log(poles.imag / unit_rate),

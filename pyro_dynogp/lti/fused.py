@@ -1,8 +1,8 @@
 """Small complex algebra in one step with its derivative: what every likelihood evaluation needs.
 
-The same formulas stand in plain torch in `covariance` and `response`, where the tests take them
-from; here they are one node each of the gradient graph instead of a hundred. Complex gradients
-follow torch: dL/dRe + i dL/dIm.
+The same covariances stand in plain torch in `covariance`, against which the tests hold these; here
+they are one node of the gradient graph instead of many. Complex gradients follow torch:
+dL/dRe + i dL/dIm.
 """
 
 from __future__ import annotations

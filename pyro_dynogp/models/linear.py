@@ -47,7 +47,7 @@ class LinearDynamicGP:
     """Output = stochastic LTI system driven by the inputs + offset + white measurement noise.
 
     The trajectory is integrated out, so that the observed site ``y`` carries the exact marginal
-    likelihood. Calling the model with a record runs the Pyro model; with a sequence of records
+    likelihood. Calling the model with a record runs the Pyro model; with several records
     they share every hyperparameter (sites ``y_0``, ``y_1``, ...). A record without outputs leaves
     ``y`` unobserved, to be sampled.
 
@@ -138,7 +138,7 @@ class LinearDynamicGP:
         """Sample all hyperparameters; the result is in the units of the record."""
         n_y = self.outputs
         several = self.several_outputs
-        time_scale = TimeScale(float(scaling.time_step), float(scaling.duration))
+        time_scale = TimeScale.of(scaling)
         modes = sample_modes(
             "g",
             inputs=self.inputs,
@@ -204,7 +204,7 @@ class LinearDynamicGP:
     def __call__(self, records: Record | Sequence[Record]) -> None:
         """Run the Pyro model on one record or on several."""
         checked = self.check(records)
-        single = isinstance(records, Record)
+        single = len(checked) == 1
         scaling = self.scaling or Scaling.from_records(records)
         system = self.sample_system(scaling)
         for index, record in enumerate(checked):

@@ -27,6 +27,7 @@ from torch import Tensor
 
 from pyro_dynogp._errors import invalid
 from pyro_dynogp.lti.modes import Modes, NoiseStructure
+from pyro_dynogp.scaling import Scaling
 
 PriorName = Literal["default", "paper"]
 
@@ -49,6 +50,11 @@ class TimeScale:
 
     step: float
     duration: float
+
+    @classmethod
+    def of(cls, scaling: Scaling) -> TimeScale:
+        """Step and duration of the training record(s)."""
+        return cls(float(scaling.time_step), float(scaling.duration))
 
     @property
     def rate_bounds(self) -> tuple[float, float]:

@@ -122,6 +122,14 @@ class TestSeveralRecords:
         assert abs(complex(fit.modes.poles[0]) - (-0.5 + 2.0j)) < 0.15
         assert len(fit.training) == 3
 
+    @pytest.mark.parametrize("initial_state", ["integrated", "site"])
+    def test_a_sequence_of_one_record_is_that_record(self, record, initial_state):
+        model = dgp.LinearDynamicGP(inputs=1, pairs=1, initial_state=initial_state)
+        options = {"starts": 1, "steps": 20, "workers": 1, "progress": False}
+        assert same(
+            dgp.fit(model, [record[:80]], **options), dgp.fit(model, record[:80], **options)
+        )
+
     def test_missing_outputs_are_integrated_out(self, one_pair):
         record = simulate_record(one_pair, 0.05, n=600, seed=5)
         holes = record.outputs.copy()
