@@ -8,13 +8,37 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pyro_dynogp import datasets, plotting
     from pyro_dynogp.distributions.conditioned import ConditionedLTIProcess
+    from pyro_dynogp.distributions.inducing import InducingLTIProcess, inducing_times
     from pyro_dynogp.distributions.process import LTIProcess, ObservedLTIProcess
     from pyro_dynogp.distributions.reparam import InnovationReparam
     from pyro_dynogp.gp import LTIKernel, LTIMean, LTIParameters
-    from pyro_dynogp.inference.fit import Fit, fit
+    from pyro_dynogp.guides.families import (
+        Family,
+        FullRank,
+        GaussMarkov,
+        InducingTimes,
+        MeanField,
+        Point,
+        SameAsPrior,
+    )
+    from pyro_dynogp.guides.layer_guide import LayerGuide
+    from pyro_dynogp.inference.fit import fit
+    from pyro_dynogp.inference.result import Fit
     from pyro_dynogp.inference.storage import load
+    from pyro_dynogp.inference.svi import TrainingDivergedError
+    from pyro_dynogp.layers.noise import Gaussian, Heteroscedastic, Likelihood, StudentT
+    from pyro_dynogp.layers.static import StaticFunction, sample_static, static_gp
     from pyro_dynogp.lti.modes import Modes
     from pyro_dynogp.lti.state import ModalState
+    from pyro_dynogp.models.architectures import (
+        Hammerstein,
+        HammersteinWiener,
+        Wiener,
+        WienerHammerstein,
+    )
+    from pyro_dynogp.models.cascade import Cascade, CascadeSystem
+    from pyro_dynogp.models.collapsed import ObservedCascade
+    from pyro_dynogp.models.layers import Dynamic, Static
     from pyro_dynogp.models.linear import LinearDynamicGP
     from pyro_dynogp.models.priors import TimeScale, sample_modes
     from pyro_dynogp.prediction.prediction import Prediction
@@ -26,50 +50,104 @@ __version__ = "0.1.0"
 
 # Names are imported when they are first used (PEP 562), so that the command line answers at once.
 _HOME = {
+    "Cascade": "pyro_dynogp.models.cascade",
+    "CascadeSystem": "pyro_dynogp.models.cascade",
     "ConditionedLTIProcess": "pyro_dynogp.distributions.conditioned",
-    "Fit": "pyro_dynogp.inference.fit",
+    "Dynamic": "pyro_dynogp.models.layers",
+    "Family": "pyro_dynogp.guides.families",
+    "Fit": "pyro_dynogp.inference.result",
+    "FullRank": "pyro_dynogp.guides.families",
+    "GaussMarkov": "pyro_dynogp.guides.families",
+    "Gaussian": "pyro_dynogp.layers.noise",
+    "Hammerstein": "pyro_dynogp.models.architectures",
+    "HammersteinWiener": "pyro_dynogp.models.architectures",
+    "Heteroscedastic": "pyro_dynogp.layers.noise",
+    "InducingLTIProcess": "pyro_dynogp.distributions.inducing",
+    "InducingTimes": "pyro_dynogp.guides.families",
     "InnovationReparam": "pyro_dynogp.distributions.reparam",
     "LTIKernel": "pyro_dynogp.gp",
     "LTIMean": "pyro_dynogp.gp",
     "LTIParameters": "pyro_dynogp.gp",
     "LTIProcess": "pyro_dynogp.distributions.process",
+    "LayerGuide": "pyro_dynogp.guides.layer_guide",
+    "Likelihood": "pyro_dynogp.layers.noise",
     "LinearDynamicGP": "pyro_dynogp.models.linear",
+    "MeanField": "pyro_dynogp.guides.families",
     "ModalState": "pyro_dynogp.lti.state",
     "Modes": "pyro_dynogp.lti.modes",
+    "ObservedCascade": "pyro_dynogp.models.collapsed",
     "ObservedLTIProcess": "pyro_dynogp.distributions.process",
+    "Point": "pyro_dynogp.guides.families",
     "Prediction": "pyro_dynogp.prediction.prediction",
     "Record": "pyro_dynogp.record",
+    "SameAsPrior": "pyro_dynogp.guides.families",
     "Scaling": "pyro_dynogp.scaling",
+    "Static": "pyro_dynogp.models.layers",
+    "StaticFunction": "pyro_dynogp.layers.static",
+    "StudentT": "pyro_dynogp.layers.noise",
     "TimeScale": "pyro_dynogp.models.priors",
+    "TrainingDivergedError": "pyro_dynogp.inference.svi",
+    "Wiener": "pyro_dynogp.models.architectures",
+    "WienerHammerstein": "pyro_dynogp.models.architectures",
     "fit": "pyro_dynogp.inference.fit",
+    "inducing_times": "pyro_dynogp.distributions.inducing",
     "load": "pyro_dynogp.inference.storage",
     "sample_modes": "pyro_dynogp.models.priors",
+    "sample_static": "pyro_dynogp.layers.static",
     "scores": "pyro_dynogp.prediction.scores",
+    "static_gp": "pyro_dynogp.layers.static",
 }
 _MODULES = ("datasets", "plotting")
 
 __all__ = [
+    "Cascade",
+    "CascadeSystem",
     "ConditionedLTIProcess",
+    "Dynamic",
+    "Family",
     "Fit",
+    "FullRank",
+    "GaussMarkov",
+    "Gaussian",
+    "Hammerstein",
+    "HammersteinWiener",
+    "Heteroscedastic",
+    "InducingLTIProcess",
+    "InducingTimes",
     "InnovationReparam",
     "LTIKernel",
     "LTIMean",
     "LTIParameters",
     "LTIProcess",
+    "LayerGuide",
+    "Likelihood",
     "LinearDynamicGP",
+    "MeanField",
     "ModalState",
     "Modes",
+    "ObservedCascade",
     "ObservedLTIProcess",
+    "Point",
     "Prediction",
     "Record",
+    "SameAsPrior",
     "Scaling",
+    "Static",
+    "StaticFunction",
+    "StudentT",
     "TimeScale",
+    "TrainingDivergedError",
+    "Wiener",
+    "WienerHammerstein",
     "datasets",
     "fit",
+    "inducing_times",
     "load",
     "plotting",
     "sample_modes",
+    "sample_static",
     "scores",
+    "static_gp",
 ]
 
 

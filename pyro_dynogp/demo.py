@@ -128,7 +128,7 @@ def run_demo(
     progress: bool = True,
     *,
     pairs: int = 5,
-    starts: int = 4,
+    restarts: int = 4,
     steps: int = 600,
     workers: int | None = None,
 ) -> dict[str, Any]:
@@ -137,7 +137,7 @@ def run_demo(
     Args:
         output_directory: made where it is missing; files of earlier runs are overwritten.
         progress: whether to show progress bars (on the standard error stream).
-        pairs: number of pole pairs. starts: number of starts. steps: most steps of SVI.
+        pairs: number of pole pairs. restarts: number of starts. steps: most steps of SVI.
         workers: number of processes; None for all processors.
 
     Returns:
@@ -155,7 +155,7 @@ def run_demo(
         LinearDynamicGP(inputs=1, pairs=pairs),
         data.train,
         method="svi",
-        starts=starts,
+        restarts=restarts,
         steps=steps,
         learning_rate=0.05,
         workers=workers,

@@ -37,14 +37,14 @@ def record(one_pair):
 @pytest.fixture(scope="session")
 def map_fit(record):
     model = dgp.LinearDynamicGP(inputs=1, pairs=1)
-    return dgp.fit(model, record[:160], starts=2, workers=1, progress=False)
+    return dgp.fit(model, record[:160], restarts=2, workers=1, progress=False)
 
 
 @pytest.fixture(scope="session")
 def svi_fit(record):
     model = dgp.LinearDynamicGP(inputs=1, pairs=1)
     return dgp.fit(
-        model, record[:160], method="svi", starts=2, steps=60, draws=40, workers=1, progress=False
+        model, record[:160], method="svi", restarts=2, steps=60, draws=40, workers=1, progress=False
     )
 
 
@@ -65,4 +65,4 @@ def two_outputs():
 @pytest.fixture(scope="session")
 def two_output_fit(two_outputs):
     model = dgp.LinearDynamicGP(inputs=2, outputs=2, pairs=2)
-    return dgp.fit(model, two_outputs[:160], starts=2, steps=120, workers=1, progress=False)
+    return dgp.fit(model, two_outputs[:160], restarts=2, steps=120, workers=1, progress=False)

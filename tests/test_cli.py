@@ -16,7 +16,7 @@ from pyro_dynogp import datasets, demo
 from pyro_dynogp.cli import main
 from pyro_dynogp.cli.data import DATASETS
 
-QUICK = ["--pairs", "1", "--starts", "1", "--steps", "15", "--workers", "1", "--quiet"]
+QUICK = ["--pairs", "1", "--restarts", "1", "--steps", "15", "--workers", "1", "--quiet"]
 COLUMNS = ["--input", "valve", "--output", "level", "--sampling-time", "0.5"]
 
 
@@ -352,7 +352,7 @@ def test_demo(tmp_path, capsys, monkeypatch):
     )
     monkeypatch.setattr(datasets, "load", lambda name: data)
     out = tmp_path / "a" / "demo"
-    result = demo.run_demo(out, progress=False, pairs=1, starts=1, steps=60, workers=1)
+    result = demo.run_demo(out, progress=False, pairs=1, restarts=1, steps=60, workers=1)
     printed = capsys.readouterr()
     assert printed.err == ""
     for kind in ("simulation", "forecast", "one-step"):

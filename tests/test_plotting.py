@@ -54,7 +54,7 @@ def record():
 @pytest.fixture(scope="module")
 def map_fit(record):
     model = dgp.LinearDynamicGP(inputs=1, pairs=1)
-    return dgp.fit(model, record[:80], starts=1, steps=25, workers=1, progress=False)
+    return dgp.fit(model, record[:80], restarts=1, steps=25, workers=1, progress=False)
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def wide_fit():
     y = np.cumsum(u, axis=0) * 0.2 + rng.normal(size=(60, 2))
     model = dgp.LinearDynamicGP(inputs=2, outputs=2, pairs=1)
     record = dgp.Record(np.arange(60.0), u, y)
-    return dgp.fit(model, record, starts=1, steps=3, workers=1, progress=False), record
+    return dgp.fit(model, record, restarts=1, steps=3, workers=1, progress=False), record
 
 
 def line(axes, label):

@@ -30,8 +30,8 @@ def test_fitting_a_record(tmp_path, monkeypatch, one_pair):
         delimiter=",",
     )
     code = blocks()[0].replace("pairs=5", "pairs=1")
-    code = code.replace("train)", "train, starts=1, workers=1, progress=False)", 1)
-    code = code.replace('"svi")', '"svi", starts=1, steps=50, workers=1, progress=False)')
+    code = code.replace("train)", "train, restarts=1, workers=1, progress=False)", 1)
+    code = code.replace('"svi")', '"svi", restarts=1, steps=50, workers=1, progress=False)')
     names: dict = {}
     exec(code, names)
     assert names["fit"].method == "svi"
@@ -39,9 +39,23 @@ def test_fitting_a_record(tmp_path, monkeypatch, one_pair):
     assert (tmp_path / "drives.safetensors").is_file()
 
 
+def test_a_deep_model_is_fitted(tmp_path, monkeypatch, one_pair):
+    monkeypatch.chdir(tmp_path)
+    code = blocks()[1].replace("pairs=3", "pairs=1, outputs=2").replace("outputs=2, pairs", "pairs")
+    code = code.replace('skip=("inputs",)', 'pairs=1, skip=("inputs",)')
+    quick = "restarts=1, steps=3, particles=1, workers=1, progress=False"
+    code = code.replace('checkpoint="run1"', f'checkpoint="run1", {quick}')
+    code = code.replace("dgp.Static(outputs=2)", "dgp.Static(outputs=2, inducing=6)")
+    names: dict = {"dgp": dgp, "train": simulate_record(one_pair, 0.1, n=60)}
+    exec(code, names)
+    assert names["fit"].method == "svi"
+    assert len(names["fit"].elbo) == 3
+    assert (tmp_path / "run1").is_dir()
+
+
 def test_custom_model_trains(one_pair):
     names: dict = {}
-    exec(blocks()[1], names)
+    exec(blocks()[2], names)
     model, record = names["model"], simulate_record(one_pair, 0.1, n=60)
     pyro.set_rng_seed(0)
     with pyro.get_param_store().scope():

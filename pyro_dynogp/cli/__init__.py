@@ -155,7 +155,7 @@ def info(subject: str | None) -> None:
     help="Posterior mode; variational posterior; Hamiltonian Monte Carlo.",
 )  # fmt: skip
 @click.option(
-    "--starts", type=click.IntRange(min=1), default=6, show_default=True,
+    "--restarts", type=click.IntRange(min=1), default=6, show_default=True,
     help="Number of points from which the optimum is sought.",
 )  # fmt: skip
 @click.option("--steps", type=click.IntRange(min=1), metavar="N", help="Most iterations.")
@@ -186,7 +186,7 @@ def fit(
     train: int | None,
     pairs: int,
     method: Any,
-    starts: int,
+    restarts: int,
     steps: int | None,
     seed: int,
     save: Path | None,
@@ -221,7 +221,7 @@ def fit(
         first if len(parts.train) == 1 else parts.train,
         method=method,
         seed=seed,
-        starts=starts,
+        restarts=restarts,
         steps=steps,
         workers=workers,
         progress=not quiet,

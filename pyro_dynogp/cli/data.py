@@ -10,7 +10,7 @@ import click
 
 if TYPE_CHECKING:
     from pyro_dynogp.datasets import Dataset
-    from pyro_dynogp.inference.fit import Fit
+    from pyro_dynogp.inference.result import Fit
     from pyro_dynogp.record import Record
 
 # One line for each shipped data set; `pyro-dynogp info NAME` tells the rest.

@@ -1,10 +1,8 @@
-"""Fit a model to measured records: one call for MAP, SVI and NUTS, one frozen result."""
+"""Fit a model to measured records: one call for every model and method, one frozen result."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -15,187 +13,34 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp._errors import invalid
-from pyro_dynogp.inference.guides import DrawsGuide, GaussianGuide, Guide, PointGuide
-from pyro_dynogp.inference.maximum import Optimizer, maximise
+from pyro_dynogp.inference.cascade_fit import GuideChoice, best_optima
+from pyro_dynogp.inference.checkpoints import Checkpoints
+from pyro_dynogp.inference.guides import GaussianGuide
+from pyro_dynogp.inference.layered import fit_layered
+from pyro_dynogp.inference.maximum import Optimizer, Optimum, maximise
+from pyro_dynogp.inference.result import Fit, Method
 from pyro_dynogp.inference.sampling import sample_posterior
 from pyro_dynogp.inference.starts import starting_values
-from pyro_dynogp.inference.variational import variational
-from pyro_dynogp.lti.modes import Modes
-from pyro_dynogp.models.linear import LinearDynamicGP, LinearSystem
+from pyro_dynogp.inference.variational import VariationalPosterior, variational
+from pyro_dynogp.models.cascade import Cascade
+from pyro_dynogp.models.linear import LinearDynamicGP
 from pyro_dynogp.parallel import seeded
-from pyro_dynogp.prediction import linear as _predict
-from pyro_dynogp.prediction.prediction import Prediction
 from pyro_dynogp.record import Record, as_records
-from pyro_dynogp.scaling import Scaling
 
-Method = Literal["map", "svi", "nuts"]
+__all__ = ["Fit", "fit"]
 
-
-@dataclass(frozen=True)
-class Fit:
-    """A fitted model: posterior draws, and what can be done with them.
-
-    Attributes:
-        model: the model with the scaling of its training record.
-        method: "map", "svi" or "nuts".
-        draws: (S, *shape) posterior draws of every latent site; S = 1 for "map".
-        mode: values of every latent site at the best optimum found.
-        history: objective after each iteration: -log p(y, values) for "map" and "nuts" (of the
-            best start), the ELBO for "svi" [nats].
-        start_energies: -log p(y, values) that each start came to, best first.
-        diagnostics: what the method says about itself, numbers by name.
-        seed: the seed.
-        training: fingerprints of the training records.
-        gaussian: the variational posterior ("svi" only).
-    """
-
-    model: LinearDynamicGP
-    method: Method
-    draws: Mapping[str, Tensor]
-    mode: Mapping[str, Tensor]
-    history: np.ndarray
-    start_energies: np.ndarray
-    diagnostics: Mapping[str, float]
-    seed: int
-    training: tuple[str, ...]
-    gaussian: GaussianGuide | None = field(default=None)
-
-    @property
-    def scaling(self) -> Scaling:
-        """Learnt from the training records."""
-        if self.model.scaling is None:
-            raise invalid("model", expected="a model with its scaling", got="none")
-        return self.model.scaling
-
-    @property
-    def guide(self) -> Guide:
-        """The posterior as a Pyro guide, to be called with a record."""
-        if self.method == "map":
-            return PointGuide(dict(self.mode))
-        return self.gaussian if self.gaussian is not None else DrawsGuide(dict(self.draws))
-
-    @cached_property
-    def system(self) -> LinearSystem:
-        """All parameters in the units of the record, one batch dimension (S,) of draws."""
-        sample = pyro.poutine.condition(self.model.sample_system, data=dict(self.draws))
-        with torch.no_grad(), pyro.poutine.block():
-            return sample(self.scaling)
-
-    @property
-    def modes(self) -> Modes:
-        """Poles and gains in the units of the record; batch (S,) of draws, none for "map"."""
-        modes = self.system.modes
-        return modes[0] if self.method == "map" else modes
-
-    @property
-    def noise_sd(self) -> np.ndarray:
-        """Posterior mean of the measurement noise (n_y,) [output]."""
-        sd = self.system.noise_sd.mean(0)
-        return np.atleast_1d(sd.numpy())
-
-    def log_joint(self, records: Record | Sequence[Record]) -> float:
-        """Log p(y, mode): of the records with the sites at the mode."""
-        conditioned = pyro.poutine.condition(self.model, data=dict(self.mode))
-        with torch.no_grad():
-            return float(pyro.poutine.trace(conditioned).get_trace(records).log_prob_sum())
-
-    def log_likelihood(self, records: Record | Sequence[Record]) -> np.ndarray:
-        """Log p(y | draw) (S,) [nats], exact marginal likelihood in the units of the record."""
-        checked = self.model.check(records)
-        total: Any = 0.0
-        with torch.no_grad():
-            for record in checked:
-                process = _predict.prior_process(self, record)
-                y = record.tensors().outputs
-                y = y if self.model.several_outputs else y[:, 0]
-                total = total + process.observed(self.system.noise_sd).log_prob(y)
-        return total.numpy()
-
-    def simulate(
-        self, record: Record, *, process_noise: bool = True, samples: int = 200, seed: int = 0
-    ) -> Prediction:
-        """Outputs from the inputs alone, from an unknown initial state.
-
-        Args:
-            record: time and inputs; its outputs are not used.
-            process_noise: False for the response of the deterministic system.
-            samples: number of joint samples that `Prediction.samples` draws. seed: for these.
-        """
-        return _predict.simulate(self, record, process_noise, samples, seed)
-
-    def predict(
-        self, record: Record, *, horizon: int = 1, samples: int = 200, seed: int = 0
-    ) -> Prediction:
-        """Each output from the inputs and from the outputs up to `horizon` samples before it.
-
-        Exact Kalman predictions. Samples of the result are independent from time to time, since
-        each time has its own data.
-        """
-        return _predict.predict(self, record, horizon, samples, seed)
-
-    def forecast(
-        self,
-        past: Record,
-        future: Record,
-        *,
-        process_noise: bool = True,
-        samples: int = 200,
-        seed: int = 0,
-    ) -> Prediction:
-        """Outputs of `future` given inputs and outputs of `past`, the state carried over exactly.
-
-        Args:
-            past: up to now. future: later times, with inputs; its outputs are not used.
-            process_noise: False if the future is known to have none.
-            samples: number of joint samples. seed: for these.
-        """
-        return _predict.forecast(self, past, future, process_noise, samples, seed)
-
-    def innovations(self, record: Record) -> np.ndarray:
-        """Standardised one-step prediction errors (n, n_y); NaN where the output is missing.
-
-        White and standard normal if the model is right.
-        """
-        prediction = self.predict(record, horizon=1)
-        return (record.outputs - prediction.mean) / prediction.sd
-
-    def save(self, path: str | Path) -> None:
-        """Write the fit to one safetensors file, from which `pyro_dynogp.load` restores it."""
-        from pyro_dynogp.inference.storage import save
-
-        save(self, path)
-
-    def summary(self) -> str:
-        """A few lines: what was fitted, how well it went, the modes at the best optimum."""
-        lines = [
-            f"{type(self.model).__name__} with pairs={self.model.pairs}, "
-            f"inputs={self.model.inputs}, outputs={self.model.outputs}; "
-            f"method {self.method!r}, seed {self.seed}",
-            "-log p(y, values) of the starts: "
-            + ", ".join(f"{e:.1f}" for e in self.start_energies[:6]),
-        ]
-        condition = pyro.poutine.condition(self.model.sample_system, data=dict(self.mode))
-        with torch.no_grad(), pyro.poutine.block():
-            modes = condition(self.scaling).modes
-        frequency, damping = modes.natural_frequency, modes.damping
-        for j in torch.argsort(frequency).tolist():
-            lines.append(
-                f"  natural frequency {float(frequency[j]):10.4g} rad/{self.scaling.time_unit}"
-                f"   damping {float(damping[j]):6.3f}"
-            )
-        lines.append(
-            "measurement noise sd: " + ", ".join(f"{value:.4g}" for value in self.noise_sd)
-        )
-        return "\n".join(lines)
+Hyperparameters = Literal["map", "normal", "multivariate normal"]
 
 
 def fit(
-    model: LinearDynamicGP,
+    model: LinearDynamicGP | Cascade,
     record: Record | Sequence[Record],
     *,
-    method: Method = "map",
+    method: Method | None = None,
+    guide: GuideChoice = None,
+    hyperparameters: Hyperparameters | None = None,
     seed: int = 0,
-    starts: int = 6,
+    restarts: int | None = None,
     steps: int | None = None,
     optimizer: Optimizer = "lbfgs",
     draws: int | None = None,
@@ -203,25 +48,45 @@ def fit(
     warmup: int = 500,
     particles: int = 8,
     learning_rate: float = 0.02,
+    checkpoint: str | Path | None = None,
     workers: int | None = None,
     progress: bool = True,
 ) -> Fit:
     """Fit a model to one record, or to several that share all parameters.
 
-    The exact marginal posterior is climbed from several starts, in parallel. "map" keeps the best
-    optimum; "svi" fits a multivariate normal to the posterior around it; "nuts" samples it.
+    The marginal posterior (exact for a linear model, by the moment-matching filter for a cascade)
+    is climbed from several starts, in parallel. "map" keeps the best optimum; "svi" fits a
+    multivariate normal to the posterior around it (of a cascade, unless `hyperparameters` says
+    otherwise, to that of inducing values and first states, with everything else at the optimum);
+    "nuts" samples it. The starts of a cascade are the best linear fits, spread over its layers;
+    its leading optima are compared by their evidence (Laplace), not by their height.
+
+    With another `guide` a cascade keeps its trajectories as sample sites, and Pyro's SVI fits them
+    and the parameters together, from every start; the best is kept by its ELBO.
 
     Args:
-        model: a `LinearDynamicGP`.
+        model: a `LinearDynamicGP` or a `Cascade` (`Wiener`, `Hammerstein`, ...).
         record: training record, or a sequence of them; scaling is learnt from it alone.
-        method: "map", "svi" or "nuts".
+        method: "map", "svi" or "nuts"; "map" by default for a linear model, "svi" for a cascade.
+        guide: of a cascade. "collapsed" (default): trajectories integrated out. "gauss-markov" or
+            "inducing times": the family of all trajectories. A mapping from site names to
+            families of `pyro_dynogp.guides`: these sites so, all others as "gauss-markov" has
+            them. A Pyro function: your own guide for the model with all its trajectories.
+        hyperparameters: of a cascade with "svi" and the collapsed guide: "map" (default) keeps
+            poles, gains, noise, lengthscales at the optimum, as the paper does; "normal" gives
+            all sites independent normals; "multivariate normal" one for all sites, which is best
+            for small models with well-excited inputs.
         seed: the same seed gives the same numbers to the last bit on one machine.
-        starts: number of starting points, the best of many random sets of poles.
-        steps: most iterations of a start (default 500; Adam 1500), or of SVI (default 1000).
+        restarts: number of starting points (default 6; 8 for a cascade, 2 with trajectories as
+            sites).
+        steps: most iterations of a start (default 500; Adam 1500; cascade 300) and, with "svi", of
+            SVI (default 1000; cascade 200, with trajectories as sites 1000).
         optimizer: "lbfgs" or "adam", for the starts.
         draws: posterior draws to keep ("svi", default 200) or to sample per chain ("nuts", 500).
         chains, warmup: of NUTS.
         particles, learning_rate: of SVI.
+        checkpoint: a folder that keeps finished pieces of the work. The same call goes on from
+            there after a kill, and ends in the same bits.
         workers: processes; None for all processors, 1 for none but this one.
         progress: whether to show progress bars.
 
@@ -229,73 +94,128 @@ def fit(
         ValueError: on channels that do not fit the model, constant or entirely missing outputs,
             unknown options, or where no start leads anywhere.
     """
+    cascade = isinstance(model, Cascade)
+    if method is None:
+        method = "svi" if cascade else "map"
     if method not in ("map", "svi", "nuts"):
         raise invalid("method", expected="'map', 'svi' or 'nuts'", got=repr(method))
     if optimizer not in ("lbfgs", "adam"):
         raise invalid("optimizer", expected="'lbfgs' or 'adam'", got=repr(optimizer))
-    for name, count in (("starts", starts), ("chains", chains), ("particles", particles)):
+    asked = restarts is not None
+    if restarts is None:
+        restarts = 8 if cascade else 6
+    counts = {"restarts": restarts, "chains": chains, "particles": particles}
+    for name, count in {**counts, "steps": 1 if steps is None else steps}.items():
         if count < 1:
             raise invalid(name, expected="a whole number >= 1", got=repr(count))
+    if hyperparameters not in (None, "map", "normal", "multivariate normal"):
+        raise invalid(
+            "hyperparameters",
+            expected="'map', 'normal' or 'multivariate normal'",
+            got=repr(hyperparameters),
+        )
+    if guide is not None and not cascade:
+        raise invalid("guide", expected="None for a linear model, which is exact", got=repr(guide))
     records = as_records(record)
     model.check(records)
     model = model.scaled_to(records)
     argument = record if isinstance(record, Record) else records
-    climb = steps if steps is not None and method == "map" else None
-    optima = maximise(
+    kept = Checkpoints.at(
+        checkpoint,
         model,
-        argument,
-        starting_values(model, records, count=starts, seed=seed),
-        optimizer=optimizer,
-        steps=climb or (500 if optimizer == "lbfgs" else 1500),
-        seed=seed,
-        workers=workers,
-        progress=progress,
+        [one.fingerprint for one in records],
+        method,
+        _identity(guide),
+        hyperparameters,
+        (seed, restarts, steps, optimizer, draws, chains, warmup, particles, learning_rate),
     )
-    best = optima[0]
-    if best.energy >= 1e15:
+    if isinstance(model, Cascade) and guide not in (None, "collapsed"):
+        if method != "svi":
+            raise invalid("method", expected="'svi' with this guide", got=repr(method))
+        return fit_layered(
+            model,
+            records,
+            guide,
+            seed=seed,
+            restarts=restarts if asked else 2,
+            steps=steps or 1000,
+            particles=particles,
+            learning_rate=learning_rate,
+            draws=draws or 200,
+            checkpoints=kept,
+            workers=workers,
+            progress=progress,
+        )
+    if isinstance(model, Cascade):
+        target: Any = model.collapsed
+        optima = best_optima(
+            target, records, restarts, steps or 300, optimizer, seed, workers, progress, kept
+        )
+    else:
+        target = model
+        climb = steps if steps is not None and method == "map" else None
+        optima = maximise(
+            model,
+            argument,
+            starting_values(model, records, count=restarts, seed=seed),
+            optimizer=optimizer,
+            steps=climb or (500 if optimizer == "lbfgs" else 1500),
+            seed=seed,
+            workers=workers,
+            progress=progress,
+            checkpoints=kept,
+        )
+    if optima[0].energy >= 1e15:
         raise ValueError(
             "fit: no start reached a point where the likelihood can be evaluated. Check the "
             "record for jumps of many orders of magnitude, or try fewer pairs."
         )
-    common: dict[str, Any] = {
-        "model": model,
-        "method": method,
-        "mode": MappingProxyType(best.values),
-        "start_energies": np.array([optimum.energy for optimum in optima]),
-        "seed": seed,
-        "training": tuple(one.fingerprint for one in records),
-    }
+    common = _common(model, method, optima, seed, records)
+    best = optima[0]
     if method == "map":
         return Fit(
             draws=MappingProxyType({k: v.unsqueeze(0) for k, v in best.values.items()}),
             history=best.history,
-            diagnostics=MappingProxyType({"iterations": float(len(best.history))}),
+            diagnostics=MappingProxyType(
+                {"iterations": float(len(best.history)), "log_evidence": best.log_evidence}
+            ),
             **common,
         )
     if method == "svi":
+        chosen = hyperparameters or ("map" if cascade else "multivariate normal")
+        posterior, fixed = _variational(
+            target,
+            argument,
+            best.values,
+            chosen,
+            steps=steps or (200 if cascade else 1000),
+            particles=particles,
+            learning_rate=learning_rate,
+            seed=seed,
+            checkpoints=kept,
+            progress=progress,
+        )
+        count = draws or 200
         with seeded(seed):
-            posterior = variational(
-                model,
-                (argument,),
-                best.values,
-                steps=steps or 1000,
-                particles=particles,
-                learning_rate=learning_rate,
-                progress=progress,
-            )
-            kept = _draws_of(posterior.guide, argument, draws or 200)
+            sampled = _draws_of(posterior.guide, argument, count)
+        sampled |= {k: v.expand(count, *v.shape).clone() for k, v in fixed.items()}
         tail = posterior.elbo[-50:]
         return Fit(
-            draws=MappingProxyType(kept),
+            draws=MappingProxyType(sampled),
             history=posterior.elbo,
             diagnostics=MappingProxyType(
-                {"elbo": float(tail.mean()), "elbo_sd": float(tail.std())}
+                {
+                    "elbo": float(tail.mean()),
+                    "elbo_sd": float(tail.std()),
+                    "log_evidence": best.log_evidence,
+                }
             ),
             gaussian=posterior.guide,
+            fixed=MappingProxyType(dict(fixed)),
             **common,
         )
-    sampled = sample_posterior(
-        model,
+    chain = sample_posterior(
+        target,
         argument,
         best.values,
         chains=chains,
@@ -305,17 +225,69 @@ def fit(
         workers=workers,
         progress=progress,
     )
-    diagnostics = {"divergences": float(sampled.divergences), "chains": float(chains)}
-    for site, values in sampled.r_hat.items():
+    diagnostics = {"divergences": float(chain.divergences), "chains": float(chains)}
+    for site, values in chain.r_hat.items():
         diagnostics[f"r_hat {site}"] = float(values.max())
-    for site, values in sampled.effective_samples.items():
+    for site, values in chain.effective_samples.items():
         diagnostics[f"effective samples {site}"] = float(values.min())
     return Fit(
-        draws=MappingProxyType({k: v.flatten(0, 1) for k, v in sampled.draws.items()}),
+        draws=MappingProxyType({k: v.flatten(0, 1) for k, v in chain.draws.items()}),
         history=best.history,
         diagnostics=MappingProxyType(diagnostics),
         **common,
     )
+
+
+def _identity(guide: GuideChoice) -> object:
+    """What tells one guide from another, the same in every process."""
+    if guide is None or isinstance(guide, str):
+        return guide
+    if isinstance(guide, Mapping):
+        return sorted(guide.items())
+    named = guide if hasattr(guide, "__qualname__") else type(guide)
+    code = getattr(guide, "__code__", None)
+    body = None
+    if code is not None:
+        constants = tuple(c for c in code.co_consts if isinstance(c, int | float | str))
+        body = (code.co_code, code.co_names, constants)
+    return (named.__module__, named.__qualname__, body)
+
+
+def _common(
+    model: Any, method: Method, optima: Sequence[Optimum], seed: int, records: Sequence[Record]
+) -> Mapping[str, Any]:
+    return {
+        "model": model,
+        "method": method,
+        "mode": MappingProxyType(optima[0].values),
+        "start_energies": np.array([optimum.energy for optimum in optima]),
+        "seed": seed,
+        "training": tuple(one.fingerprint for one in records),
+    }
+
+
+def _variational(
+    target: Any,
+    argument: Any,
+    values: Mapping[str, Tensor],
+    hyperparameters: Hyperparameters,
+    **options: Any,
+) -> tuple[VariationalPosterior, Mapping[str, Tensor]]:
+    """Normal posterior of the free sites, and the values of those that stay at the optimum."""
+    if hyperparameters != "map":
+        independent = hyperparameters == "normal"
+        found = variational(target, (argument,), dict(values), independent=independent, **options)
+        return found, {}
+    free = {k: v for k, v in values.items() if k.endswith("_values") or "_initial_state" in k}
+    fixed = {k: v for k, v in values.items() if k not in free}
+    if not free:
+        raise invalid(
+            "hyperparameters",
+            expected="'normal' or 'multivariate normal' for a cascade without static layers",
+            got="'map'",
+        )
+    conditioned = pyro.poutine.condition(target, data=fixed)
+    return variational(conditioned, (argument,), free, **options), fixed
 
 
 def _draws_of(guide: GaussianGuide, args: Any, count: int) -> dict[str, Tensor]:

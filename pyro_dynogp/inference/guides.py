@@ -89,6 +89,22 @@ class GaussianGuide:
         return values
 
 
+@dataclass(frozen=True)
+class JointGuide:
+    """Some sites at a point, the others normal.
+
+    Attributes:
+        point: of the former. gaussian: of the latter.
+    """
+
+    point: PointGuide
+    gaussian: GaussianGuide
+
+    def __call__(self, *args: Any) -> dict[str, Tensor]:
+        """Sample every site."""
+        return {**self.point(*args), **self.gaussian(*args)}
+
+
 def gaussian_guide(potential: Potential, loc: Tensor, scale_tril: Tensor) -> GaussianGuide:
     """Guide over the sites of a potential."""
     return GaussianGuide(loc.detach(), scale_tril.detach(), tuple(potential.sites))

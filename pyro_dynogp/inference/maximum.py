@@ -11,11 +11,20 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
+from pyro_dynogp.inference.checkpoints import (
+    NOTHING_KEPT,
+    Checkpoints,
+    Piece,
+    tensor_text,
+    text_tensor,
+)
 from pyro_dynogp.inference.potential import Potential
 from pyro_dynogp.parallel import parallel_map, seeded
 from pyro_dynogp.record import Record
 
 Optimizer = Literal["lbfgs", "adam"]
+# Beside these, "preconditioned" is for ridges that neither follows.
+Method = Literal["lbfgs", "adam", "preconditioned"]
 
 
 @dataclass(frozen=True)
@@ -27,12 +36,14 @@ class Optimum:
         values: value of every latent site.
         history: energy after each iteration.
         message: why the optimiser stopped.
+        log_evidence: log p(y) by Laplace's approximation [nats], where it was computed.
     """
 
     energy: float
     values: dict[str, Tensor]
     history: np.ndarray
     message: str
+    log_evidence: float = -np.inf
 
 
 @dataclass(frozen=True)
@@ -40,9 +51,11 @@ class _Task:
     model: Any
     records: Record | Sequence[Record]
     values: dict[str, Tensor]
-    optimizer: Optimizer
+    optimizer: Method
     steps: int
     seed: int
+    checkpoints: Checkpoints
+    key: str
 
 
 def _lbfgs(potential: Potential, z: np.ndarray, steps: int) -> tuple[np.ndarray, list, str]:
@@ -83,15 +96,107 @@ def _adam(potential: Potential, z: np.ndarray, steps: int) -> tuple[np.ndarray, 
     return best_z, history, "all steps used"
 
 
+def _preconditioned(
+    potential: Potential, z: np.ndarray, steps: int
+) -> tuple[np.ndarray, list, str]:
+    """L-BFGS in coordinates in which all curvatures at z are about one, negative ones too.
+
+    Time constants, gains and first states that make up for each other leave ridges whose curvatures
+    differ by a factor of 10^6; L-BFGS alone stops on them.
+    """
+    eigenvalues, vectors = np.linalg.eigh(potential.quick_hessian(z, jacobian=False))
+    root = vectors / np.sqrt(np.maximum(np.abs(eigenvalues), 1.0))
+
+    def function(x: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = potential.value_and_gradient(z + root @ x)
+        return value, root.T @ gradient
+
+    history: list[float] = []
+    result = minimize(
+        function,
+        np.zeros_like(z),
+        jac=True,
+        method="L-BFGS-B",
+        callback=lambda intermediate_result: history.append(float(intermediate_result.fun)),
+        options={"maxiter": steps, "maxfun": 2 * steps, "maxcor": 30, "ftol": 1e-8},
+    )
+    return z + root @ result.x, history, str(result.message)
+
+
+_METHODS = {"lbfgs": _lbfgs, "adam": _adam, "preconditioned": _preconditioned}
+
+
 def _optimise(task: _Task) -> Optimum:
+    piece = task.checkpoints.piece(task.key, lambda: _pack(_climb(task)))
+    return _unpack(piece)
+
+
+def _climb(task: _Task) -> Optimum:
     with seeded(task.seed):
         potential = Potential(task.model, (task.records,), task.values)
         z = potential.pack(task.values).numpy()
-        method = _lbfgs if task.optimizer == "lbfgs" else _adam
-        z, history, message = method(potential, z, task.steps)
+        z, history, message = _METHODS[task.optimizer](potential, z, task.steps)
         energy = potential.value_and_gradient(z)[0]
         values = {k: v.detach() for k, v in potential.unpack(torch.tensor(z)).items()}
-    return Optimum(energy, values, np.asarray(history), message)
+        evidence = -np.inf
+        if task.optimizer == "preconditioned":
+            evidence = potential.log_evidence(z)
+    return Optimum(energy, values, np.asarray(history), message, evidence)
+
+
+def _pack(optimum: Optimum) -> Piece:
+    return {
+        "energy": torch.tensor(optimum.energy, dtype=torch.float64),
+        "history": torch.tensor(optimum.history, dtype=torch.float64),
+        "message": text_tensor(optimum.message),
+        "evidence": torch.tensor(optimum.log_evidence, dtype=torch.float64),
+        **{f"value/{name}": value for name, value in optimum.values.items()},
+    }
+
+
+def _unpack(piece: Piece) -> Optimum:
+    values = {k[len("value/") :]: v for k, v in piece.items() if k.startswith("value/")}
+    message = tensor_text(piece["message"])
+    history = piece["history"].numpy()
+    return Optimum(float(piece["energy"]), values, history, message, float(piece["evidence"]))
+
+
+def polish(
+    model: Any,
+    records: Record | Sequence[Record],
+    optima: Sequence[Optimum],
+    *,
+    steps: int,
+    seed: int,
+    workers: int | None,
+    progress: bool,
+    checkpoints: Checkpoints = NOTHING_KEPT,
+) -> list[Optimum]:
+    """Climb on from the best optima by preconditioned L-BFGS, and rank them by their evidence.
+
+    The highest density is a poor judge between optima of very different width: a resonance at just
+    the frequency of an input, with a state that cancels it, can fit a little better and forecasts
+    badly. Its posterior mass is small, which the evidence knows.
+
+    Returns:
+        The polished optima by log evidence, the best first, then the rest by energy.
+    """
+    leading = list(optima[:POLISHED])
+    tasks = [
+        _Task(model, records, one.values, "preconditioned", steps, seed, checkpoints, f"polish-{i}")
+        for i, one in enumerate(leading)
+    ]
+    found = parallel_map(_optimise, tasks, workers=workers, progress=progress, description="polish")
+    joined = [
+        replace(after, history=np.concatenate([before.history, after.history]))
+        for before, after in zip(leading, found, strict=True)
+    ]
+    joined.sort(key=lambda optimum: -optimum.log_evidence)
+    return [*joined, *optima[POLISHED:]]
+
+
+# How many of the best optima are polished.
+POLISHED = 4
 
 
 def maximise(
@@ -104,6 +209,8 @@ def maximise(
     seed: int = 0,
     workers: int | None = None,
     progress: bool = False,
+    checkpoints: Checkpoints = NOTHING_KEPT,
+    key: str = "optimum",
 ) -> list[Optimum]:
     """Climb from every start; the optima sorted by energy, best first.
 
@@ -113,7 +220,19 @@ def maximise(
     """
 
     def climb(values: Sequence[dict[str, Tensor]], count: int, label: str) -> list[Optimum]:
-        tasks = [_Task(model, records, value, optimizer, count, seed) for value in values]
+        tasks = [
+            _Task(
+                model,
+                records,
+                value,
+                optimizer,
+                count,
+                seed,
+                checkpoints,
+                f"{key}-{label}-{i}",
+            )
+            for i, value in enumerate(values)
+        ]
         return parallel_map(_optimise, tasks, workers=workers, progress=progress, description=label)
 
     def best_first(optima: list[Optimum]) -> list[Optimum]:

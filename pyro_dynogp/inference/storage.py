@@ -3,49 +3,53 @@
 from __future__ import annotations
 
 import json
-from dataclasses import fields
+from collections.abc import Mapping
+from dataclasses import asdict, fields
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pyro
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
+from torch import Tensor
 
 from pyro_dynogp._errors import invalid
 from pyro_dynogp.inference.guides import GaussianGuide
 from pyro_dynogp.inference.potential import Potential
+from pyro_dynogp.layers.noise import Likelihood
+from pyro_dynogp.models.cascade import Cascade
+from pyro_dynogp.models.layers import Dynamic, Layer, Static
 from pyro_dynogp.models.linear import LinearDynamicGP
 from pyro_dynogp.scaling import Scaling
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fit import Fit
+    from pyro_dynogp.inference.result import Fit
 
 FORMAT = "pyro_dynogp.fit"
 VERSION = 1
 # The models that a file may name: a file never decides what code is run.
-MODELS = {"LinearDynamicGP": LinearDynamicGP}
+MODELS = {"Cascade": Cascade, "LinearDynamicGP": LinearDynamicGP}
+LAYERS: dict[str, type[Dynamic] | type[Static]] = {"Dynamic": Dynamic, "Static": Static}
 
 
 def save(fit: Fit, path: str | Path) -> None:
     """Write a fit to a file; `load` restores every number to the last bit.
 
     Raises:
-        ValueError: where the folder does not exist.
+        ValueError: where the folder does not exist, or a layer has a kernel of the user's.
     """
+    options = _options(fit.model)
     tensors = {f"draws/{name}": value.contiguous() for name, value in fit.draws.items()}
     tensors |= {f"mode/{name}": value.contiguous() for name, value in fit.mode.items()}
+    tensors |= {f"fixed/{name}": value.contiguous() for name, value in fit.fixed.items()}
     tensors["history"] = torch.as_tensor(np.ascontiguousarray(fit.history))
     tensors["start_energies"] = torch.as_tensor(np.ascontiguousarray(fit.start_energies))
     if fit.gaussian is not None:
         tensors["gaussian/loc"] = fit.gaussian.loc.contiguous()
         tensors["gaussian/scale_tril"] = fit.gaussian.scale_tril.contiguous()
-    options = {
-        item.name: getattr(fit.model, item.name)
-        for item in fields(fit.model)
-        if item.name != "scaling"
-    }
     header = {
         "format": FORMAT,
         "version": VERSION,
@@ -57,6 +61,7 @@ def save(fit: Fit, path: str | Path) -> None:
         "training": list(fit.training),
         "diagnostics": dict(fit.diagnostics),
         "sites": list(fit.draws),
+        "fixed": list(fit.fixed),
     }
     folder = Path(path).resolve().parent
     if not folder.is_dir():
@@ -74,7 +79,7 @@ def load(path: str | Path) -> Fit:
         ValueError: where the file is missing, damaged, not a pyro_dynogp fit, or of a version
             that this package does not know.
     """
-    from pyro_dynogp.inference.fit import Fit
+    from pyro_dynogp.inference.result import Fit
 
     path = Path(path)
     if not path.is_file():
@@ -82,7 +87,9 @@ def load(path: str | Path) -> Fit:
     try:
         with safe_open(str(path), framework="pt") as file:
             metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            # Copies: vectorised sums round by where a tensor lies in memory, and in the file it
+            # may lie anywhere.
+            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise ValueError(
             f"load: {path} is not a safetensors file, or it is damaged ({error})."
@@ -108,19 +115,63 @@ def load(path: str | Path) -> Fit:
         raise ValueError(f"load: {path} is incomplete or damaged ({error}).") from error
 
 
+def _options(model: LinearDynamicGP | Cascade) -> dict[str, Any]:
+    """Everything that a model is made with but its scaling, as JSON has it."""
+    options = {f.name: getattr(model, f.name) for f in fields(model) if f.name != "scaling"}
+    if isinstance(model, Cascade):
+        for one in model.wires:
+            if isinstance(one.layer, Static) and one.layer.kernel is not None:
+                raise invalid(
+                    "save",
+                    expected="layers with the default kernel (kernel=None)",
+                    got=f"{type(one.layer.kernel).__name__} in layer {one.name!r}",
+                    advice="A file holds numbers alone, no kernel of gpytorch: keep fit.draws and "
+                    "the code that makes the model.",
+                )
+        options["layers"] = [
+            {
+                "kind": type(layer).__name__,
+                **{f.name: getattr(layer, f.name) for f in fields(layer)},
+            }
+            for layer in model.layers
+        ]
+        options["likelihood"] = asdict(model.likelihood)
+    return options
+
+
+def _model(name: str, options: Mapping[str, Any], scaling: Scaling) -> LinearDynamicGP | Cascade:
+    """Inverse of `_options`."""
+    given = dict(options)
+    if name == "Cascade":
+        given["layers"] = tuple(_layer(layer) for layer in given["layers"])
+        given["likelihood"] = Likelihood(**given["likelihood"])
+    return MODELS[name](**given, scaling=scaling)
+
+
+def _layer(options: Mapping[str, Any]) -> Layer:
+    given = dict(options)
+    kind = given.pop("kind")
+    if kind not in LAYERS:
+        raise ValueError(f"load: unknown layer {kind!r}; known are {sorted(LAYERS)}.")
+    return LAYERS[kind](**{**given, "skip": tuple(given["skip"])})
+
+
 def _restore(kind: type[Fit], header: dict[str, Any], tensors: dict[str, Any]) -> Fit:
     name = header["model"]
     if name not in MODELS:
         raise ValueError(f"load: unknown model {name!r}; known are {sorted(MODELS)}.")
     scaling = Scaling.from_dict(header["scaling"])
-    model = MODELS[name](**header["options"], scaling=scaling)
+    model = _model(name, header["options"], scaling)
     draws = {site: tensors[f"draws/{site}"] for site in header["sites"]}
     mode = {site: tensors[f"mode/{site}"] for site in header["sites"]}
+    # Files of before there were cascades do not say.
+    fixed = {site: tensors[f"fixed/{site}"] for site in header.get("fixed", ())}
     gaussian = None
     if "gaussian/loc" in tensors:
-        sites = Potential(lambda: model.sample_system(scaling), (), mode).sites
         gaussian = GaussianGuide(
-            tensors["gaussian/loc"], tensors["gaussian/scale_tril"], tuple(sites)
+            tensors["gaussian/loc"],
+            tensors["gaussian/scale_tril"],
+            _sites(model, scaling, mode, fixed, len(header["training"])),
         )
     return kind(
         model=model,
@@ -133,4 +184,25 @@ def _restore(kind: type[Fit], header: dict[str, Any], tensors: dict[str, Any]) -
         seed=header["seed"],
         training=tuple(header["training"]),
         gaussian=gaussian,
+        fixed=MappingProxyType(fixed),
     )
+
+
+def _sites(
+    model: LinearDynamicGP | Cascade,
+    scaling: Scaling,
+    mode: Mapping[str, Tensor],
+    fixed: Mapping[str, Tensor],
+    records: int,
+) -> tuple[Any, ...]:
+    """The sites of the normal posterior in their order, without the training records."""
+
+    def parameters() -> None:
+        target = model.collapsed if isinstance(model, Cascade) else model
+        target.sample_system(scaling)
+        for index in range(records):
+            model.sample_states("" if records == 1 else f"_{index}")
+
+    free = {name: value for name, value in mode.items() if name not in fixed}
+    conditioned = pyro.poutine.condition(parameters, data=dict(fixed))
+    return tuple(Potential(conditioned, (), free).sites)

@@ -1,1 +1,7 @@
 """Mathematics of stochastic linear time-invariant systems: tensors in, tensors out, no Pyro."""
+
+from pathlib import Path
+
+from pyro_dynogp._compiled_cache import drop_stale
+
+drop_stale(Path(__file__).parent)

@@ -201,6 +201,14 @@ class LinearDynamicGP:
         mean = torch.zeros_like(modes.poles)
         return ModalState(mean, state_covariance(modes) + system.past_inputs)
 
+    def sample_states(self, suffix: str) -> dict[str, Tensor]:
+        """Sample the numbers behind the first state of a record, where they are a site."""
+        if self.initial_state != "site":
+            return {}
+        one = torch.ones(2 * self.pairs, dtype=torch.float64)
+        name = f"initial_state{suffix}"
+        return {"initial_state": pyro.sample(name, dist.Normal(0.0 * one, one).to_event(1))}
+
     def __call__(self, records: Record | Sequence[Record]) -> None:
         """Run the Pyro model on one record or on several."""
         checked = self.check(records)
@@ -209,11 +217,10 @@ class LinearDynamicGP:
         system = self.sample_system(scaling)
         for index, record in enumerate(checked):
             suffix = "" if single else f"_{index}"
+            states = self.sample_states(suffix)
             state: Any = None
-            if self.initial_state == "site":
-                one = torch.ones(2 * self.pairs, dtype=torch.float64)
-                z = pyro.sample(f"initial_state{suffix}", dist.Normal(0.0 * one, one).to_event(1))
-                state = initial_mean(system.past_inputs, z)
+            if states:
+                state = initial_mean(system.past_inputs, states["initial_state"])
             process = self.process(system, record, scaling, state)
             outputs = record.tensors().outputs
             if not self.several_outputs and record.n_outputs:

@@ -156,6 +156,7 @@ def sample_modes(
     feedthrough: bool = True,
     process_noise: bool = True,
     time_scale: TimeScale | None = None,
+    gain_scale: float = 3.0,
     priors: PriorName = "default",
 ) -> Modes:
     """Sample a stochastic LTI system, for inputs and outputs of unit standard deviation.
@@ -163,7 +164,8 @@ def sample_modes(
     Sites (all start with ``<name>_``), * marking what depends on the options:
 
     - ``log_decay``, ``log_frequency`` (P,): see `sample_poles`.
-    - ``input_gain`` (P, n_u, 2)*: g1 and g0 of each section (output per input), normal(0, 3).
+    - ``input_gain`` (P, n_u, 2)*: g1 and g0 of each section (output per input), normal(0,
+      gain_scale).
     - ``output_gain`` (n_y, P, 2)*: direction of c, only for several outputs; normal(0, 1).
     - ``noise_gain_local_scale`` (P,), ``noise_gain_unit`` (P, n_l, 2)*: horseshoe of scale 0.1 on
       n1 and n0 of the noise's sections (n1 s + n0 |lambda|) sqrt(4 r) / (...), r the typical rate
@@ -183,6 +185,7 @@ def sample_modes(
         process_noise: whether there is process noise at all.
         time_scale: step and duration of the record [s]; by default time is counted in samples of
             a record of 1000.
+        gain_scale: standard deviation of the gains a priori.
         priors: "default", or "paper" for flat ones but for the horseshoe.
 
     Returns:
@@ -195,7 +198,9 @@ def sample_modes(
     flat = priors == "paper"
     B = L = D = None
     if inputs:
-        gain = pyro.sample(f"{name}_input_gain", _normal(FLAT if flat else 3.0, pairs, inputs, 2))
+        gain = pyro.sample(
+            f"{name}_input_gain", _normal(FLAT if flat else gain_scale, pairs, inputs, 2)
+        )
         B = residues(poles, _section(poles, gain) * poles.abs()[..., None, None])
         if feedthrough:
             shape = (inputs,) if outputs is None else (outputs, inputs)
@@ -217,7 +222,7 @@ def sample_modes(
 def _section(poles: Tensor, gain: Tensor) -> Tensor:
     """(g1, g0) to the numerator (g1, g0 |lambda|)."""
     size = poles.abs().unsqueeze(-1)
-    return torch.stack([gain[..., 0], gain[..., 1] * size], -1)
+    return torch.stack(torch.broadcast_tensors(gain[..., 0], gain[..., 1] * size), -1)
 
 
 def unit_direction(raw: Tensor) -> Tensor:

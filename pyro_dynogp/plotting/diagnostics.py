@@ -13,7 +13,7 @@ from pyro_dynogp._errors import invalid
 from pyro_dynogp.plotting import style
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fit import Fit
+    from pyro_dynogp.inference.result import Fit
     from pyro_dynogp.record import Record
 
 

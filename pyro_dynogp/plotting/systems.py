@@ -15,7 +15,7 @@ from pyro_dynogp.lti import views
 from pyro_dynogp.plotting import style
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fit import Fit
+    from pyro_dynogp.inference.result import Fit
 
 DAMPING_LINES = (0.05, 0.1, 0.2, 0.4, 0.7)
 

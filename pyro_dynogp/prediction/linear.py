@@ -15,17 +15,24 @@ from pyro_dynogp.distributions.process import LTIProcess
 from pyro_dynogp.distributions.trajectory import split_missing
 from pyro_dynogp.lti.filtering import predict_k_steps
 from pyro_dynogp.lti.state import ModalState, propagate
+from pyro_dynogp.models.linear import LinearDynamicGP
 from pyro_dynogp.parallel import seeded
+from pyro_dynogp.prediction.clock import gap_between
 from pyro_dynogp.prediction.prediction import Prediction
 from pyro_dynogp.record import Record
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fit import Fit
+    from pyro_dynogp.inference.result import Fit
+
+
+def _model(fit: Fit) -> LinearDynamicGP:
+    assert isinstance(fit.model, LinearDynamicGP)
+    return fit.model
 
 
 def prior_process(fit: Fit, record: Record, *, process_noise: bool = True) -> LTIProcess:
     """Noise-free trajectories along a record, one batch element for each draw."""
-    model, system = fit.model, fit.system
+    model, system = _model(fit), fit.system
     state = None
     if model.initial_state == "site":
         # The site belongs to the training record; elsewhere the state is unknown again.
@@ -48,24 +55,11 @@ def forecast(
     """See `Fit.forecast`."""
     _one(fit, past)
     _one(fit, future)
-    gap = float(future.time[0] - past.time[-1])
-    if past.start != future.start:
-        if past.start is None or future.start is None:
-            raise invalid(
-                "future", expected="the same kind of clock as past", got="stamps and plain times"
-            )
-        gap += (future.start - past.start).total_seconds()
-    if gap <= 0:
-        raise invalid(
-            "future",
-            expected="times after the end of past",
-            got=f"a first time {-gap:.6g} s before it",
-            advice="Split one record with record.split(k), or give both the same clock.",
-        )
+    gap = gap_between(past, future)
     if not past.n_outputs:
         raise invalid("past", expected="outputs to start from", got="none")
     with torch.no_grad():
-        system, model, scaling = fit.system, fit.model, fit.scaling
+        system, model, scaling = fit.system, _model(fit), fit.scaling
         before = prior_process(fit, past)
         y = past.tensors().outputs
         y = y if model.several_outputs else y[:, 0]

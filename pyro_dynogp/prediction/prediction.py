@@ -26,7 +26,8 @@ class Prediction:
         output_names: of the n_y outputs.
         component_mean: (S, n, n_y) mean for each draw.
         component_variance: (S, n, n_y) variance of the noise-free output for each draw.
-        noise_variance: (S, n_y) variance of the measurement noise for each draw.
+        noise_variance: (S, n_y) variance of the measurement noise for each draw; (S, n, n_y) where
+            it changes over time.
         parts: share of the variance (n, n_y) by cause; they add up to the variance.
         sampler: draws joint samples (S', n, n_y); called once.
         kind: what was predicted, in words.
@@ -69,7 +70,8 @@ class Prediction:
     @cached_property
     def component_sd(self) -> np.ndarray:
         """(S, n, n_y): standard deviation of measured outputs for each draw."""
-        return np.sqrt(self.component_variance + self.noise_variance[:, None, :])
+        noise = self.noise_variance
+        return np.sqrt(self.component_variance + (noise if noise.ndim == 3 else noise[:, None, :]))
 
     @cached_property
     def samples(self) -> np.ndarray:

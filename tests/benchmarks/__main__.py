@@ -11,9 +11,16 @@ import joblib
 import numba
 import torch
 
-from tests.benchmarks import calibration, example2, speed
+from tests.benchmarks import calibration, cascade_cost, example2, reference, speed, wiener
 
-PARTS = {"speed": speed.run, "example2": example2.run, "calibration": calibration.run}
+PARTS = {
+    "speed": speed.run,
+    "example2": example2.run,
+    "wiener": wiener.run,
+    "cascade_cost": cascade_cost.run,
+    "reference": reference.run,
+    "calibration": calibration.run,
+}
 
 
 def main(names: list[str]) -> int:

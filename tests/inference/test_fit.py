@@ -17,7 +17,7 @@ class TestMap:
     def test_recovers_the_system(self, one_pair):
         record = simulate_record(one_pair, 0.05, n=1200, seed=5)
         fit = dgp.fit(
-            dgp.LinearDynamicGP(inputs=1, pairs=1), record, starts=3, workers=1, progress=False
+            dgp.LinearDynamicGP(inputs=1, pairs=1), record, restarts=3, workers=1, progress=False
         )
         pole = complex(fit.modes.poles[0])
         assert abs(pole - (-0.5 + 2.0j)) < 0.08
@@ -44,7 +44,7 @@ class TestMap:
             dgp.LinearDynamicGP(inputs=1, pairs=1),
             record[:160],
             optimizer="adam",
-            starts=1,
+            restarts=1,
             steps=600,
             workers=1,
             progress=False,
@@ -53,7 +53,7 @@ class TestMap:
 
     def test_same_seed_same_bits_here_and_in_processes(self, record, map_fit):
         model = dgp.LinearDynamicGP(inputs=1, pairs=1)
-        options = {"starts": 2, "progress": False}
+        options = {"restarts": 2, "progress": False}
         assert same(map_fit, dgp.fit(model, record[:160], workers=1, **options))
         assert same(map_fit, dgp.fit(model, record[:160], workers=2, **options))
 
@@ -67,7 +67,7 @@ class TestMap:
             dgp.LinearDynamicGP(inputs=1, pairs=1),
             record[:80],
             method="svi",
-            starts=1,
+            restarts=1,
             steps=20,
             workers=1,
             progress=False,
@@ -82,7 +82,7 @@ class TestMap:
             dgp.Modes([-2.0 + 0.5j], [[3.0]], [1.0], [[0.1]]), 0.3, n=120, seed=9
         )
         model = dgp.LinearDynamicGP(inputs=1, pairs=1)
-        options = {"method": "svi", "starts": 2, "steps": 60, "draws": 40}
+        options = {"method": "svi", "restarts": 2, "steps": 60, "draws": 40}
         second = dgp.fit(model, other, workers=1, progress=False, **options)
         again = dgp.fit(model, record[:160], workers=1, progress=False, **options)
         assert same(again, svi_fit)
@@ -96,7 +96,7 @@ def test_every_variant_of_the_model_can_be_fitted(record, initial_state, priors,
     model = dgp.LinearDynamicGP(
         inputs=1, pairs=2, initial_state=initial_state, priors=priors, noise=noise
     )
-    fit = dgp.fit(model, record[:160], starts=1, steps=60, workers=1, progress=False)
+    fit = dgp.fit(model, record[:160], restarts=1, steps=60, workers=1, progress=False)
     test = dgp.scores(fit.forecast(record[:160], record[160:]), record[160:])
     assert test["nrmse"] < 0.6
     assert fit.noise_sd[0] == pytest.approx(0.1, rel=0.5)
@@ -117,7 +117,7 @@ class TestSeveralRecords:
     def test_more_records_pin_the_pole_down(self, one_pair):
         records = [simulate_record(one_pair, 0.1, n=150, seed=s) for s in range(3)]
         model = dgp.LinearDynamicGP(inputs=1, pairs=1)
-        fit = dgp.fit(model, [records[0], records[1][:90], records[2]], starts=2, workers=1,
+        fit = dgp.fit(model, [records[0], records[1][:90], records[2]], restarts=2, workers=1,
                       progress=False)  # fmt: skip
         assert abs(complex(fit.modes.poles[0]) - (-0.5 + 2.0j)) < 0.15
         assert len(fit.training) == 3
@@ -125,7 +125,7 @@ class TestSeveralRecords:
     @pytest.mark.parametrize("initial_state", ["integrated", "site"])
     def test_a_sequence_of_one_record_is_that_record(self, record, initial_state):
         model = dgp.LinearDynamicGP(inputs=1, pairs=1, initial_state=initial_state)
-        options = {"starts": 1, "steps": 20, "workers": 1, "progress": False}
+        options = {"restarts": 1, "steps": 20, "workers": 1, "progress": False}
         assert same(
             dgp.fit(model, [record[:80]], **options), dgp.fit(model, record[:80], **options)
         )
@@ -137,7 +137,7 @@ class TestSeveralRecords:
         fit = dgp.fit(
             dgp.LinearDynamicGP(inputs=1, pairs=1),
             record.with_outputs(holes),
-            starts=2,
+            restarts=2,
             workers=1,
             progress=False,
         )
@@ -176,7 +176,7 @@ def test_nuts_one_pair_of_300_samples(one_pair):
     """The sampler mixes, and SVI's posterior agrees with it."""
     record = simulate_record(one_pair, 0.1, n=300, seed=2)
     model = dgp.LinearDynamicGP(inputs=1, pairs=1)
-    options = {"starts": 2, "progress": False}
+    options = {"restarts": 2, "progress": False}
     nuts = dgp.fit(model, record, method="nuts", chains=4, draws=300, warmup=150, seed=1, **options)
     r_hat = {k: v for k, v in nuts.diagnostics.items() if k.startswith("r_hat")}
     assert len(r_hat) == 8
@@ -198,7 +198,7 @@ def test_nuts_one_pair_of_300_samples(one_pair):
     [
         ({"method": "mcmc"}, "method: expected 'map', 'svi' or 'nuts'"),
         ({"optimizer": "sgd"}, "optimizer: expected 'lbfgs' or 'adam'"),
-        ({"starts": 0}, "starts: expected a whole number >= 1"),
+        ({"restarts": 0}, "restarts: expected a whole number >= 1"),
         ({"chains": 0, "method": "nuts"}, "chains"),
         ({"workers": 0}, "workers"),
     ],

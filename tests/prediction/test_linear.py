@@ -168,7 +168,7 @@ def test_innovations_of_a_true_model_are_white_and_standard(one_pair):
     from tests.conftest import simulate_record
 
     record = simulate_record(one_pair, 0.1, n=2000, seed=11)
-    fit = dgp.fit(dgp.LinearDynamicGP(inputs=1, pairs=1), record[:1000], starts=2, workers=1,
+    fit = dgp.fit(dgp.LinearDynamicGP(inputs=1, pairs=1), record[:1000], restarts=2, workers=1,
                   progress=False)  # fmt: skip
     e = fit.innovations(record)[1000:, 0]
     assert e.std() == pytest.approx(1.0, abs=4 * np.sqrt(0.5 / 1000))
@@ -192,7 +192,7 @@ def test_elpd_does_not_depend_on_the_scaling(record):
         time_unit="ms",
     )  # fmt: skip
     model = dgp.LinearDynamicGP(inputs=1, pairs=1)
-    options = {"starts": 2, "workers": 1, "progress": False}
+    options = {"restarts": 2, "workers": 1, "progress": False}
     one = dgp.fit(model, record[:160], **options)
     two = dgp.fit(model, other[:160], **options)
     a = one.forecast(record[:160], record[160:]).log_density(record.outputs[160:])

@@ -1,0 +1,109 @@
+"""Training of cascades: linear fits first, then all layers together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from pyro_dynogp.inference.cascade_starts import (
+    Values,
+    leading_layers,
+    linear_twin,
+    plans,
+    starting_point,
+)
+from pyro_dynogp.inference.checkpoints import Checkpoints
+from pyro_dynogp.inference.maximum import Optimizer, Optimum, maximise, polish
+from pyro_dynogp.inference.starts import starting_values
+from pyro_dynogp.models.cascade import Cascade
+from pyro_dynogp.models.layers import Dynamic
+from pyro_dynogp.parallel import seeded
+from pyro_dynogp.record import Record
+
+GuideChoice = str | Mapping[str, Any] | Callable[..., Any] | None
+
+# Starts and iterations of the linear fits that come first.
+LINEAR_STARTS = 6
+LINEAR_STEPS = 150
+
+
+def starting_points(
+    model: Cascade,
+    records: Sequence[Record],
+    count: int,
+    steps: int,
+    seed: int,
+    workers: int | None,
+    progress: bool,
+    checkpoints: Checkpoints,
+) -> list[Values]:
+    """Values of every site for each restart, from the optima of linear fits."""
+    assert model.scaling is not None
+    optima: dict[str, Sequence[Values]] = {}
+    known: dict[Any, Sequence[Values]] = {}
+    for one in leading_layers(model):
+        assert isinstance(one.layer, Dynamic)
+        twin = linear_twin(model, one.layer, model.scaling)
+        if twin not in known:
+            training = _one_output(records) if twin.outputs < model.outputs else tuple(records)
+            twin = twin.scaled_to(training)
+            found = maximise(
+                twin,
+                training if len(training) > 1 else training[0],
+                starting_values(twin, training, count=LINEAR_STARTS, seed=seed),
+                steps=min(LINEAR_STEPS, steps),
+                seed=seed,
+                workers=workers,
+                progress=progress,
+                checkpoints=checkpoints,
+                key=f"linear-{one.name}",
+            )
+            known[twin] = [optimum.values for optimum in found]
+        optima[one.name] = known[twin]
+    with seeded(seed):  # what has no typical value is drawn
+        return [
+            starting_point(model, records, model.scaling, plan)
+            for plan in plans(model, optima, count, seed)
+        ]
+
+
+def _one_output(records: Sequence[Record]) -> tuple[Record, ...]:
+    return tuple(record.select(outputs=[record.output_names[0]]) for record in records)
+
+
+def best_optima(
+    model: Cascade,
+    records: Sequence[Record],
+    restarts: int,
+    steps: int,
+    optimizer: Optimizer,
+    seed: int,
+    workers: int | None,
+    progress: bool,
+    checkpoints: Checkpoints,
+) -> list[Optimum]:
+    """Optima of the collapsed model from all starts, best first."""
+    starts = starting_points(model, records, restarts, steps, seed, workers, progress, checkpoints)
+    argument = records[0] if len(records) == 1 else tuple(records)
+    optima = maximise(
+        model,
+        argument,
+        starts,
+        optimizer=optimizer,
+        steps=steps,
+        seed=seed,
+        workers=workers,
+        progress=progress,
+        checkpoints=checkpoints,
+        key="cascade",
+    )
+    return polish(
+        model,
+        argument,
+        optima,
+        steps=max(1, steps // 2),
+        seed=seed,
+        workers=workers,
+        progress=progress,
+        checkpoints=checkpoints,
+    )

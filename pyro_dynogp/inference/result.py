@@ -1,0 +1,266 @@
+"""A fitted model: posterior draws, and what can be done with them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pyro
+import torch
+from torch import Tensor
+
+from pyro_dynogp._errors import invalid
+from pyro_dynogp.inference.guides import (
+    DrawsGuide,
+    GaussianGuide,
+    Guide,
+    JointGuide,
+    PointGuide,
+)
+from pyro_dynogp.lti.modes import Modes
+from pyro_dynogp.models.cascade import Cascade
+from pyro_dynogp.models.collapsed import collapsed_of, outputs_with_gaps
+from pyro_dynogp.models.linear import LinearDynamicGP
+from pyro_dynogp.prediction import cascade as _cascade
+from pyro_dynogp.prediction import linear as _linear
+from pyro_dynogp.prediction.beginning import beginning
+from pyro_dynogp.prediction.cascade import LayerTrajectory, StaticBand
+from pyro_dynogp.prediction.prediction import Prediction
+from pyro_dynogp.record import Record
+from pyro_dynogp.scaling import Scaling
+
+Method = Literal["map", "svi", "nuts"]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted model: posterior draws, and what can be done with them.
+
+    Attributes:
+        model: the model with the scaling of its training record.
+        method: "map", "svi" or "nuts".
+        draws: (S, *shape) posterior draws of every latent site; S = 1 for "map".
+        mode: values of every latent site at the best optimum found.
+        history: objective after each iteration: -log p(y, values) for "map" and "nuts" (of the
+            best start), the ELBO for "svi" [nats].
+        start_energies: -log p(y, values) that each start came to (-ELBO where trajectories are
+            sites), best first; of a cascade the leading ones are ranked by their evidence instead.
+        diagnostics: what the method says about itself, numbers by name.
+        seed: the seed.
+        training: fingerprints of the training records.
+        gaussian: the variational posterior ("svi" without trajectories as sites).
+        fixed: sites that `gaussian` does not have, at the optimum.
+        trajectories: (S, ...) draws of trajectories and other sites that belong to the training
+            record, where the guide had them.
+    """
+
+    model: LinearDynamicGP | Cascade
+    method: Method
+    draws: Mapping[str, Tensor]
+    mode: Mapping[str, Tensor]
+    history: np.ndarray
+    start_energies: np.ndarray
+    diagnostics: Mapping[str, float]
+    seed: int
+    training: tuple[str, ...]
+    gaussian: GaussianGuide | None = field(default=None)
+    fixed: Mapping[str, Tensor] = field(default_factory=dict)
+    trajectories: Mapping[str, Tensor] = field(default_factory=dict)
+
+    @property
+    def scaling(self) -> Scaling:
+        """Learnt from the training records."""
+        if self.model.scaling is None:
+            raise invalid("model", expected="a model with its scaling", got="none")
+        return self.model.scaling
+
+    @property
+    def guide(self) -> Guide:
+        """The posterior as a Pyro guide, to be called with a record."""
+        if self.method == "map":
+            return PointGuide(dict(self.mode))
+        if self.gaussian is None:
+            return DrawsGuide(dict(self.draws))
+        return (
+            JointGuide(PointGuide(dict(self.fixed)), self.gaussian) if self.fixed else self.gaussian
+        )
+
+    @cached_property
+    def system(self) -> Any:
+        """All parameters, batch (S,) of draws: a `LinearSystem` or a `CascadeSystem`."""
+        return self._system_at(self.draws)
+
+    def _system_at(self, values: Mapping[str, Tensor]) -> Any:
+        model = self.model
+        if isinstance(model, Cascade):
+            model = model.collapsed  # parameters alone, no trajectories
+        sample = pyro.poutine.condition(model.sample_system, data=dict(values))
+        with torch.no_grad(), pyro.poutine.block():
+            return sample(self.scaling)
+
+    @property
+    def _predictions(self) -> Any:
+        return _cascade if isinstance(self.model, Cascade) else _linear
+
+    @property
+    def modes(self) -> Modes:
+        """Poles and gains in the units of the record; batch (S,) of draws, none for "map".
+
+        Of a linear model; those of a cascade's layer g are `system.layer("g").modes`.
+        """
+        if isinstance(self.model, Cascade):
+            raise invalid(
+                "modes",
+                expected="a LinearDynamicGP",
+                got="a Cascade, whose layers have modes of their own",
+                advice='Use fit.system.layer("g").modes.',
+            )
+        modes: Modes = self.system.modes
+        return modes[0] if self.method == "map" else modes
+
+    @property
+    def noise_sd(self) -> np.ndarray:
+        """Posterior mean of the measurement noise's scale (n_y,) [output]."""
+        if isinstance(self.model, Cascade):
+            sd = self.system.noise.constant_sd
+            if sd is None:
+                raise invalid(
+                    "noise_sd", expected="noise of constant scale", got="noise that varies"
+                )
+            return self.scaling.output_scale * sd.mean(0).numpy()
+        return np.atleast_1d(self.system.noise_sd.mean(0).numpy())
+
+    @property
+    def elbo(self) -> np.ndarray:
+        """Evidence lower bound after each step of SVI; for "map" log p(y, values) [nats]."""
+        return self.history if self.method == "svi" else -self.history
+
+    def layers(self, record: Record) -> Mapping[str, LayerTrajectory]:
+        """Posterior trajectories of all layers along a record, given its inputs and outputs.
+
+        Of a cascade: by the smoother of the moment-matching filter. A record without outputs
+        gives the trajectories that the inputs alone say.
+        """
+        self._only_cascade("layers")
+        return _cascade.layers(self, record)
+
+    def static_function(
+        self, name: str, record: Record, *, channel: int = 0, points: int = 200
+    ) -> StaticBand:
+        """A static layer's function with its band, where a record moves it.
+
+        Args:
+            name: of the layer. record: says over which range, and where data are.
+            channel: the input that varies, others at their mean. points: number of points.
+        """
+        self._only_cascade("static_function")
+        return _cascade.static_function(self, name, record, channel, points)
+
+    def _only_cascade(self, what: str) -> None:
+        if not isinstance(self.model, Cascade):
+            raise invalid(
+                what,
+                expected="a fitted Cascade",
+                got=type(self.model).__name__,
+                advice="A linear model has one trajectory and no static function: use simulate, "
+                "predict or forecast.",
+            )
+
+    def log_joint(self, records: Record | Sequence[Record]) -> float:
+        """Log p(y, mode): of the records with the sites at the mode."""
+        model = self.model
+        if isinstance(model, Cascade):
+            model = model.collapsed
+        conditioned = pyro.poutine.condition(model, data=dict(self.mode))
+        with torch.no_grad():
+            return float(pyro.poutine.trace(conditioned).get_trace(records).log_prob_sum())
+
+    def log_likelihood(self, records: Record | Sequence[Record]) -> np.ndarray:
+        """Log p(y | draw) (S,) [nats], exact marginal likelihood in the units of the record."""
+        checked = self.model.check(records)
+        total: Any = 0.0
+        with torch.no_grad():
+            if isinstance(self.model, Cascade):
+                for record in checked:
+                    system = beginning(self, record)
+                    y = outputs_with_gaps(record)
+                    total = total + collapsed_of(system, self.scaling, record).log_prob(y)
+                return total.numpy()
+            for record in checked:
+                process = _linear.prior_process(self, record)
+                y = record.tensors().outputs
+                y = y if self.model.several_outputs else y[:, 0]
+                total = total + process.observed(self.system.noise_sd).log_prob(y)
+        return total.numpy()
+
+    def simulate(
+        self, record: Record, *, process_noise: bool = True, samples: int = 200, seed: int = 0
+    ) -> Prediction:
+        """Outputs from the inputs alone, from an unknown initial state.
+
+        Args:
+            record: time and inputs; its outputs are not used.
+            process_noise: False for the response of the deterministic system.
+            samples: number of joint samples that `Prediction.samples` draws. seed: for these.
+        """
+        return self._predictions.simulate(self, record, process_noise, samples, seed)
+
+    def predict(
+        self, record: Record, *, horizon: int = 1, samples: int = 200, seed: int = 0
+    ) -> Prediction:
+        """Each output from the inputs and from the outputs up to `horizon` samples before it.
+
+        Exact Kalman predictions. Samples of the result are independent from time to time, since
+        each time has its own data.
+        """
+        return self._predictions.predict(self, record, horizon, samples, seed)
+
+    def forecast(
+        self,
+        past: Record,
+        future: Record,
+        *,
+        process_noise: bool = True,
+        samples: int = 200,
+        seed: int = 0,
+    ) -> Prediction:
+        """Outputs of `future` given inputs and outputs of `past`, the state carried over exactly.
+
+        Args:
+            past: up to now. future: later times, with inputs; its outputs are not used.
+            process_noise: False if the future is known to have none.
+            samples: number of joint samples. seed: for these.
+        """
+        return self._predictions.forecast(self, past, future, process_noise, samples, seed)
+
+    def innovations(self, record: Record) -> np.ndarray:
+        """Standardised one-step prediction errors (n, n_y); NaN where the output is missing.
+
+        White and standard normal if the model is right.
+        """
+        prediction = self.predict(record, horizon=1)
+        return (record.outputs - prediction.mean) / prediction.sd
+
+    def save(self, path: str | Path) -> None:
+        """Write the fit to one safetensors file, from which `pyro_dynogp.load` restores it.
+
+        `trajectories` are left out: draws over the whole training record, which no prediction
+        needs; `layers` computes smoothed ones.
+
+        Raises:
+            ValueError: where the folder does not exist, or a static layer has a gpytorch kernel of
+                its own: a file holds numbers, no code.
+        """
+        from pyro_dynogp.inference.storage import save
+
+        save(self, path)
+
+    def summary(self) -> str:
+        """A few lines: what was fitted, how well it went, the modes at the best optimum."""
+        from pyro_dynogp.inference.summary import summary
+
+        return summary(self)

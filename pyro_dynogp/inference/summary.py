@@ -1,0 +1,58 @@
+"""What a fit says about itself in a few lines of text."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from pyro_dynogp.models.cascade import Cascade, DynamicSystem
+from pyro_dynogp.models.layers import Dynamic
+
+if TYPE_CHECKING:
+    from pyro_dynogp.inference.result import Fit
+
+
+def summary(fit: Fit) -> str:
+    """What was fitted, how well it went, the modes at the best optimum."""
+    system = fit._system_at(fit.mode)
+    model = fit.model
+    if isinstance(model, Cascade):
+        chain = " -> ".join(f"{one.name} ({_describe(one.layer)})" for one in model.wires)
+        lines = [f"Cascade of {model.inputs} inputs: {chain}"]
+    else:
+        lines = [
+            f"{type(model).__name__} with pairs={model.pairs}, "
+            f"inputs={model.inputs}, outputs={model.outputs}"
+        ]
+    lines[0] += f"; method {fit.method!r}, seed {fit.seed}"
+    energies = ", ".join(f"{e:.1f}" for e in fit.start_energies[:6])
+    lines.append(f"-log p(y, values) of the starts: {energies}")
+    unit = fit.scaling.time_unit
+    if isinstance(model, Cascade):
+        for one, layer in zip(system.wires, system.layers, strict=True):
+            if isinstance(layer, DynamicSystem):
+                lines.append(f"layer {one.name}:")
+                lines.extend(_modes(layer.modes, unit))
+    else:
+        lines.extend(_modes(system.modes, unit))
+    if not isinstance(model, Cascade) or not model.likelihood.varying:
+        sd = ", ".join(f"{value:.4g}" for value in fit.noise_sd)
+        lines.append(f"measurement noise sd: {sd}")
+    return "\n".join(lines)
+
+
+def _describe(layer: Any) -> str:
+    width = f", {layer.outputs} outputs" if layer.outputs > 1 else ""
+    if isinstance(layer, Dynamic):
+        return f"dynamic, {layer.pairs} pairs{width}"
+    return f"static, {layer.inducing} inducing values{width}"
+
+
+def _modes(modes: Any, unit: str) -> list[str]:
+    frequency, damping = modes.natural_frequency, modes.damping
+    return [
+        f"  natural frequency {float(frequency[j]):10.4g} rad/{unit}"
+        f"   damping {float(damping[j]):6.3f}"
+        for j in torch.argsort(frequency).tolist()
+    ]

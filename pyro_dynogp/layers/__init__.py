@@ -1,0 +1,1 @@
+"""Static Gaussian-process layers and their kernels as Pyro sample sites."""

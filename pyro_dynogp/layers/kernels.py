@@ -1,0 +1,412 @@
+r"""Any GPyTorch kernel as a function of tensors, its hyperparameters being Pyro sample sites.
+
+The functions of the distance that matter most are evaluated by plain formulas,
+
+    r^2 = sum_c ((x_c - x'_c) / l_c)^2,
+    rbf       exp(-r^2 / 2)
+    matern12  exp(-r)
+    matern32  (1 + sqrt(3) r) exp(-sqrt(3) r)
+    matern52  (1 + sqrt(5) r + 5/3 r^2) exp(-sqrt(5) r)
+
+as are scales, sums and products of kernels; everything else is the kernel's own `forward`. The
+formulas are GPyTorch's, without its hand-written derivative, which takes the first derivative for
+a constant: a Hessian through it would be silently wrong.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+
+import pyro
+import pyro.distributions as dist
+import torch
+from gpytorch import constraints, kernels, priors
+from linear_operator import to_dense
+from torch import Tensor
+from torch.distributions import AffineTransform
+from torch.distributions import constraints as supports
+
+from pyro_dynogp._errors import invalid
+from pyro_dynogp._tensors import broadcast
+
+# What keeps the derivative of r finite at r = 0.
+TINY = 1e-30
+MATERN = {0.5: "matern12", 1.5: "matern32", 2.5: "matern52"}
+# Kernels whose GPyTorch code takes parameters with more leading dimensions than they were made
+# with; of all others one batch element is evaluated at a time.
+BATCHED = (
+    kernels.RBFKernel,
+    kernels.MaternKernel,
+    kernels.ScaleKernel,
+    kernels.AdditiveKernel,
+    kernels.ProductKernel,
+    kernels.PeriodicKernel,
+    kernels.LinearKernel,
+    kernels.RQKernel,
+    kernels.CosineKernel,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class SampledKernel:
+    """A kernel with given hyperparameters.
+
+    Attributes:
+        kernel: the form; its own parameter values are not used, its constraints do nothing.
+        values: hyperparameters (*b, *shape) by the full name that they have in the kernel, each as
+            what it means (a positive lengthscale, not its softplus inverse).
+        channels: d, number of channels of the points.
+    """
+
+    kernel: kernels.Kernel
+    values: Mapping[str, Tensor]
+    channels: int
+
+    def __call__(self, x1: Tensor, x2: Tensor) -> Tensor:
+        """Dense covariance (*b, n, m) of points x1 (*b, n, d) and x2 (*b, m, d).
+
+        Raises:
+            ValueError: if the points or the kernel have another number of channels.
+        """
+        K = self._evaluate(x1, x2)
+        if K.shape[-2:] != (x1.shape[-2], x2.shape[-2]):
+            raise invalid(
+                "kernel",
+                expected=f"a covariance of {x1.shape[-2]} and {x2.shape[-2]} points",
+                got=f"shape {tuple(K.shape)}",
+                advice="Kernels of several outputs or of derivatives are not supported.",
+            )
+        return K
+
+    def diagonal(self, x: Tensor) -> Tensor:
+        """Variance (*b, n) at points x (*b, n, d)."""
+        return self._evaluate(x, None)
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """Batch shape *b that the hyperparameters broadcast to."""
+        return broadcast(*(value.shape[: value.dim() - k] for value, k in self._sizes()))
+
+    @property
+    def radial(self) -> tuple[str, Tensor] | None:
+        """Name of the function of the distance and its lengthscales (*b, d), or None.
+
+        The name is "rbf", "matern12", "matern32" or "matern52"; a scale above it is
+        `radial_variance`. None also where the kernel sees only some of the channels.
+        """
+        found = self._radial()
+        return None if found is None else found[:2]
+
+    @property
+    def radial_variance(self) -> Tensor | None:
+        """Variance (*b) that multiplies the function of the distance; None without a scale."""
+        found = self._radial()
+        return None if found is None else found[2]
+
+    def _radial(self) -> tuple[str, Tensor, Tensor | None] | None:
+        base, prefix, variance = self.kernel, "", None
+        if type(base) is kernels.ScaleKernel:
+            if base.active_dims is not None:
+                return None
+            variance = self.values["raw_outputscale"]
+            base, prefix = base.base_kernel, "base_kernel."
+        form = _form(base)
+        if form is None or base.active_dims is not None:
+            return None
+        lengthscale = self.values[prefix + "raw_lengthscale"].squeeze(-2)
+        _check_lengthscale(lengthscale, self.channels)
+        return form, lengthscale.expand(*lengthscale.shape[:-1], self.channels), variance
+
+    def _sizes(self) -> list[tuple[Tensor, int]]:
+        """Each value and the number of its own dimensions, those that are not batch."""
+        return [(v, self.kernel.get_parameter(name).dim()) for name, v in self.values.items()]
+
+    def _evaluate(self, x1: Tensor, x2: Tensor | None) -> Tensor:
+        for argument, x in (("x1", x1), ("x2", x2)):
+            if x is not None and (x.dim() < 2 or x.shape[-1] != self.channels):
+                raise invalid(
+                    argument,
+                    expected=f"shape (..., n, {self.channels})",
+                    got=f"shape {tuple(x.shape)}",
+                )
+        found = self._radial()
+        if found is not None:
+            return _scaled(_distance_function(*found[:2], x1, x2), found[2], x2 is None)
+        whole = _Evaluation(self.kernel)
+        modules = (m for m in self.kernel.modules() if isinstance(m, kernels.Kernel))
+        if all(type(module) in BATCHED for module in modules):
+            return whole.at(self.values, x1, x2)
+        points = [x1] if x2 is None else [x1, x2]
+        batch = broadcast(self.batch_shape, *(x.shape[:-2] for x in points))
+        if not batch:
+            return whole.at(self.values, x1, x2)
+        flat = [x.expand(batch + x.shape[-2:]).reshape(-1, *x.shape[-2:]) for x in points]
+        values = {
+            name: v.expand(batch + v.shape[v.dim() - k :]).reshape(-1, *v.shape[v.dim() - k :])
+            for name, (v, k) in zip(self.values, self._sizes(), strict=True)
+        }
+        each = [
+            whole.at({name: v[i] for name, v in values.items()}, *(x[i] for x in flat))
+            for i in range(batch.numel())
+        ]
+        return torch.stack(each).reshape(batch + each[0].shape)
+
+
+class _Evaluation(torch.nn.Module):
+    """Dense evaluation of a kernel, whose parameters a functional call replaces."""
+
+    def __init__(self, kernel: kernels.Kernel) -> None:
+        super().__init__()
+        self.kernel = kernel
+
+    def at(self, values: Mapping[str, Tensor], x1: Tensor, x2: Tensor | None = None) -> Tensor:
+        named = {f"kernel.{name}": value for name, value in values.items()}
+        return torch.func.functional_call(self, named, (x1, x2))
+
+    def forward(self, x1: Tensor, x2: Tensor | None) -> Tensor:
+        return _dense(self.kernel, x1, x2)
+
+
+def _dense(kernel: kernels.Kernel, x1: Tensor, x2: Tensor | None, select: bool = True) -> Tensor:
+    """Covariance (*b, n, m) of a tree of kernels, or the variance (*b, n) where x2 is None."""
+    if select and kernel.active_dims is not None:
+        x1 = x1.index_select(-1, kernel.active_dims)
+        x2 = None if x2 is None else x2.index_select(-1, kernel.active_dims)
+    if type(kernel) is kernels.ScaleKernel:
+        # A scale takes over the active channels of what it scales.
+        base = _dense(kernel.base_kernel, x1, x2, select=False)
+        return _scaled(base, kernel.outputscale, x2 is None)
+    if type(kernel) in (kernels.AdditiveKernel, kernels.ProductKernel):
+        total = _dense(kernel.kernels[0], x1, x2)
+        for part in kernel.kernels[1:]:
+            K = _dense(part, x1, x2)
+            total = total + K if type(kernel) is kernels.AdditiveKernel else total * K
+        return total
+    form = _form(kernel)
+    if form is not None:
+        return _distance_function(form, kernel.lengthscale.squeeze(-2), x1, x2)
+    if x2 is not None:
+        return to_dense(kernel.forward(x1, x2))
+    diagonal = to_dense(kernel.forward(x1, x1, diag=True))
+    # Some kernels do not know of `diag`.
+    whole = diagonal.dim() > 1 and diagonal.shape[-2:] == (x1.shape[-2],) * 2
+    return diagonal.diagonal(dim1=-2, dim2=-1) if whole else diagonal
+
+
+def _form(kernel: kernels.Kernel) -> str | None:
+    if type(kernel) is kernels.MaternKernel:
+        return MATERN[kernel.nu]
+    return "rbf" if type(kernel) is kernels.RBFKernel else None
+
+
+def _scaled(K: Tensor, variance: Tensor | None, diagonal: bool) -> Tensor:
+    if variance is None:
+        return K
+    return K * (variance[..., None] if diagonal else variance[..., None, None])
+
+
+def _check_lengthscale(lengthscale: Tensor, channels: int) -> None:
+    if lengthscale.shape[-1] not in (1, channels):
+        raise invalid(
+            "kernel",
+            expected=f"one lengthscale, or one for each of {channels} channels",
+            got=f"{lengthscale.shape[-1]} lengthscales",
+            advice="Set ard_num_dims to the number of channels that the kernel sees.",
+        )
+
+
+def _distance_function(form: str, lengthscale: Tensor, x1: Tensor, x2: Tensor | None) -> Tensor:
+    """Kernel of unit variance (*b, n, m), or its diagonal where x2 is None.
+
+    Args:
+        form: name of the function.
+        lengthscale: (*b, d) or (*b, 1). x1: (*b, n, d). x2: (*b, m, d).
+    """
+    _check_lengthscale(lengthscale, x1.shape[-1])
+    if x2 is None:
+        shape = broadcast(lengthscale.shape[:-1], x1.shape[:-2]) + x1.shape[-2:-1]
+        return x1.new_ones(shape)
+    inverse = lengthscale.reciprocal().unsqueeze(-2)
+    # Differences, not |x|^2 - 2 x'y + |y|^2: near points would lose their distance to rounding.
+    difference = (x1 * inverse).unsqueeze(-2) - (x2 * inverse).unsqueeze(-3)
+    square = difference.square().sum(-1)
+    if form == "rbf":
+        return (-0.5 * square).exp()
+    r = (square + TINY).sqrt()
+    if form == "matern12":
+        return (-r).exp()
+    if form == "matern32":
+        a = math.sqrt(3.0) * r
+        return (1.0 + a) * (-a).exp()
+    a = math.sqrt(5.0) * r
+    return (1.0 + a + a.square() / 3.0) * (-a).exp()
+
+
+@lru_cache
+def _default_form(channels: int) -> kernels.Kernel:
+    # Shared, and safe to share: a function of the distance is evaluated without touching it.
+    return kernels.MaternKernel(1.5, ard_num_dims=channels).double().requires_grad_(False)
+
+
+def sample_kernel(name: str, kernel: kernels.Kernel | None, channels: int) -> SampledKernel:
+    """Sample the hyperparameters of a kernel.
+
+    Sites: for None, which stands for a Matern-3/2 kernel of unit variance, ``<name>_lengthscale``
+    (d,), LogNormal(0, 1). For a GPyTorch kernel ``<name>_<parameter>`` with the shape of the
+    parameter, of each that requires a gradient: "base_kernel.raw_lengthscale" is
+    ``<name>_base_kernel_lengthscale``. Its value is what the parameter means (within its
+    constraint), its distribution the prior registered with the kernel, or else one around the
+    present value, see `hyperprior`.
+
+    Args:
+        name: prefix of the sites.
+        kernel: a GPyTorch kernel without batch shape, copied, never changed; or None.
+        channels: d, number of channels of the points.
+
+    Returns:
+        The kernel, with the batch shape of the sites (particles).
+
+    Raises:
+        ValueError: if `kernel` is something else or has a prior that cannot be a site's.
+    """
+    if kernel is None:
+        zero = torch.zeros(channels, dtype=torch.float64)
+        lengthscale = pyro.sample(f"{name}_lengthscale", dist.LogNormal(zero, 1.0).to_event(1))
+        form = _default_form(channels)
+        return SampledKernel(form, {"raw_lengthscale": lengthscale.unsqueeze(-2)}, channels)
+    if not isinstance(kernel, kernels.Kernel):
+        raise invalid("kernel", expected="a gpytorch kernel or None", got=type(kernel).__name__)
+    if kernel.batch_shape:
+        raise invalid(
+            "kernel",
+            expected="a kernel without batch shape",
+            got=f"batch shape {tuple(kernel.batch_shape)}",
+            advice="Batch dimensions come from the plates around the layer.",
+        )
+    form = copy.deepcopy(kernel).double()
+    names = {_plain(parameter) + "_prior" for parameter, _ in form.named_parameters()}
+    stray = {prior for prior, *_ in form.named_priors()} - names
+    if stray:
+        raise invalid(
+            "kernel",
+            expected="each prior named after its parameter ('lengthscale_prior')",
+            got=", ".join(sorted(stray)),
+        )
+    values = {}
+    for parameter, raw in form.named_parameters():
+        if raw.requires_grad:
+            site = f"{name}_{_plain(parameter).replace('.', '_')}"
+            values[parameter] = pyro.sample(site, hyperprior(form, parameter))
+        else:
+            values[parameter] = _meaning(form, parameter)
+    form.requires_grad_(False)
+    _drop_constraints(form)
+    return SampledKernel(form, values, channels)
+
+
+def hyperprior(kernel: kernels.Kernel, parameter: str) -> dist.Distribution:
+    """Distribution of one parameter of a kernel, of what it means.
+
+    The prior registered for it (a Gamma, LogNormal, Normal, HalfCauchy, HalfNormal or Uniform one,
+    which then replaces the constraint's bounds); without one and within the constraint's bounds
+    LogNormal(log(present value), 1) if positive, the same for the distance to the bound if bounded
+    on one side by another number, uniform between two bounds, and Normal(present value, 1) if free.
+
+    Args:
+        kernel: a GPyTorch kernel.
+        parameter: full name of the parameter, "base_kernel.raw_lengthscale".
+
+    Returns:
+        A distribution whose event is the parameter's shape.
+
+    Raises:
+        ValueError: if the registered prior is of another kind or wider than the constraint's sign.
+    """
+    value = _meaning(kernel, parameter)
+    constraint = kernel.constraint_for_parameter_name(parameter)
+    lower, upper = (-math.inf, math.inf)
+    if constraint is not None:
+        lower, upper = (float(b.detach().double()) for b in constraint)
+    registered = _registered_prior(kernel, parameter, positive=lower >= 0.0)
+    if registered is not None:
+        return registered.expand(value.shape).to_event(value.dim())
+    one = torch.ones_like(value)
+    prior: dist.Distribution
+    if math.isfinite(lower) and math.isfinite(upper):
+        prior = dist.Uniform(lower * one, upper * one)
+    elif lower == 0.0:
+        prior = dist.LogNormal(value.log(), one)
+    elif math.isfinite(lower):
+        prior = dist.LogNormal((value - lower).log(), one)
+        prior = dist.TransformedDistribution(prior, [_From(lower, 1.0)])
+    elif math.isfinite(upper):
+        prior = dist.LogNormal((upper - value).log(), one)
+        prior = dist.TransformedDistribution(prior, [_From(upper, -1.0)])
+    else:
+        prior = dist.Normal(value, one)
+    return prior.to_event(value.dim())
+
+
+class _From(AffineTransform):
+    """Positive numbers to those above (scale 1) or below (scale -1) a bound; knows its range."""
+
+    @supports.dependent_property(is_discrete=False, event_dim=0)
+    def codomain(self) -> supports.Constraint:
+        above = self.scale > 0
+        return supports.greater_than(self.loc) if above else supports.less_than(self.loc)
+
+
+def _registered_prior(
+    kernel: kernels.Kernel, parameter: str, positive: bool
+) -> dist.Distribution | None:
+    """Pyro's twin of the GPyTorch prior of a parameter, or None without one."""
+    found = [entry for entry in kernel.named_priors() if entry[0] == _plain(parameter) + "_prior"]
+    if not found:
+        return None
+    _, module, p, closure, _ = found[0]
+    kind = type(p)
+    plain = torch.equal(closure(module), _meaning(kernel, parameter))
+    if plain and getattr(p, "_transform", None) is None:
+        if kind is priors.GammaPrior:
+            return dist.Gamma(p.concentration.double(), p.rate.double())
+        if kind is priors.LogNormalPrior:
+            return dist.LogNormal(p.loc.double(), p.scale.double())
+        if kind is priors.HalfCauchyPrior:
+            return dist.HalfCauchy(p.scale.double())
+        if kind is priors.HalfNormalPrior:
+            return dist.HalfNormal(p.scale.double())
+        if kind is priors.NormalPrior and not positive:
+            return dist.Normal(p.loc.double(), p.scale.double())
+        if kind is priors.UniformPrior and not (positive and bool((p.low < 0).any())):
+            return dist.Uniform(p.low.double(), p.high.double())
+    raise invalid(
+        "kernel",
+        expected="priors of the parameters themselves that are Gamma, LogNormal, HalfCauchy, "
+        "HalfNormal or Uniform (for a parameter of any sign also Normal)",
+        got=f"{kind.__name__} for {parameter}",
+        advice="Register another prior, or none for the default.",
+    )
+
+
+def _plain(parameter: str) -> str:
+    return parameter.replace("raw_", "")
+
+
+def _meaning(kernel: kernels.Kernel, parameter: str) -> Tensor:
+    """Present value of a parameter within its constraint."""
+    raw = kernel.get_parameter(parameter).detach()
+    constraint = kernel.constraint_for_parameter_name(parameter)
+    return raw if constraint is None else constraint.transform(raw)
+
+
+def _drop_constraints(kernel: kernels.Kernel) -> None:
+    """Let each parameter of our own copy be what it means, so that nothing has to be inverted."""
+    for name in [name for name, _ in kernel.named_parameters()]:
+        if kernel.constraint_for_parameter_name(name) is not None:
+            owner, _, last = name.rpartition(".")
+            free = constraints.GreaterThan(-math.inf, transform=None)
+            kernel.get_submodule(owner).register_constraint(last, free)

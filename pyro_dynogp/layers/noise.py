@@ -1,0 +1,164 @@
+"""Measurement noise as Pyro distributions, and as the Gaussian mixtures that the filter uses."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pyro
+import pyro.distributions as dist
+import torch
+from scipy.special import gammainc, gammaincinv
+from torch import Tensor
+
+from pyro_dynogp._errors import invalid
+from pyro_dynogp.layers.static import StaticFunction, sample_static
+
+# Components of the Gaussian mixture that stands for a Student-t.
+COMPONENTS = 16
+# Prior of the standard deviation: log-normal around this share of the output's.
+TYPICAL = 0.1
+FLAT = 1e3
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """Distribution of measured outputs given the noise-free ones; independent over time.
+
+    Make one by `Gaussian`, `StudentT` or `Heteroscedastic`.
+
+    Attributes:
+        degrees_of_freedom: of a Student-t; None for a Gaussian.
+        varying: whether the logarithm of the standard deviation is a Gaussian process of the
+            (scaled) inputs, instead of constant.
+        inducing: number of inducing values of that process.
+    """
+
+    degrees_of_freedom: float | None = None
+    varying: bool = False
+    inducing: int = 8
+
+    def __post_init__(self) -> None:
+        nu = self.degrees_of_freedom
+        if nu is not None and not nu > 0:
+            raise invalid("degrees_of_freedom", expected="a number > 0", got=repr(nu))
+        if self.inducing < 1:
+            raise invalid("inducing", expected="a whole number >= 1", got=repr(self.inducing))
+
+    @property
+    def gaussian(self) -> bool:
+        """Whether the noise is Gaussian."""
+        return self.degrees_of_freedom is None
+
+    def sample(self, outputs: int, inputs: int, *, flat: bool = False) -> Noise:
+        """Sample its parameters.
+
+        Sites: ``noise_sd`` (n_y,), log-normal around a tenth of the output's standard deviation;
+        with `varying`, ``log_noise_...`` instead, those of a static layer of the inputs, which
+        gives log(sd / 0.1).
+        """
+        if self.varying:
+            if not inputs:
+                raise invalid(
+                    "likelihood",
+                    expected="constant noise for a model without inputs",
+                    got="noise that varies with the inputs",
+                )
+            function = sample_static(
+                "log_noise", channels=inputs, outputs=outputs, inducing=self.inducing
+            )
+            return Noise(self, None, function)
+        zero = torch.zeros(outputs, dtype=torch.float64)
+        spread = FLAT if flat else 1.5
+        sd = pyro.sample(
+            "noise_sd", dist.LogNormal(zero + math.log(TYPICAL), zero + spread).to_event(1)
+        )
+        return Noise(self, sd, None)
+
+    def components(self) -> tuple[np.ndarray, np.ndarray]:
+        """Shares and variance multiples (K,) of the Gaussian mixture: one component if Gaussian."""
+        if self.degrees_of_freedom is None:
+            return np.ones(1), np.ones(1)
+        return student_components(self.degrees_of_freedom)
+
+
+def Gaussian() -> Likelihood:
+    """White Gaussian measurement noise of constant standard deviation."""
+    return Likelihood()
+
+
+def StudentT(degrees_of_freedom: float = 4.0) -> Likelihood:
+    """White Student-t measurement noise, for records with outliers."""
+    return Likelihood(degrees_of_freedom=float(degrees_of_freedom))
+
+
+def Heteroscedastic(inducing: int = 8) -> Likelihood:
+    """White Gaussian noise whose log standard deviation is a Gaussian process of the inputs."""
+    return Likelihood(varying=True, inducing=inducing)
+
+
+def student_components(nu: float, count: int = COMPONENTS) -> tuple[np.ndarray, np.ndarray]:
+    """Gaussian mixture for a Student-t of unit scale: shares and variances (count,).
+
+    A Student-t is Gaussian with precision w ~ Gamma(nu/2, nu/2). Bins of w, even in log w where the
+    mass is, each give a component with the bin's probability and its mean precision.
+    """
+    a = 0.5 * nu
+    low, high = gammaincinv(a, 1e-9) / a, gammaincinv(a, 1.0 - 1e-6) / a
+    inner = np.exp(np.linspace(math.log(low), math.log(high), count + 1)[1:-1])
+    edges = np.concatenate([[0.0], inner, [np.inf]])
+    mass = np.diff(gammainc(a, a * edges))
+    precision = np.diff(gammainc(a + 1.0, a * edges)) / mass  # E[w | bin]: the gamma of shape a + 1
+    return mass / mass.sum(), 1.0 / precision
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Measurement noise given its parameters, in units of the scaled outputs.
+
+    Attributes:
+        likelihood: its kind. constant_sd: (*b, n_y), or None where it varies.
+        log_sd: static function of the inputs, or None.
+    """
+
+    likelihood: Likelihood
+    constant_sd: Tensor | None
+    log_sd: StaticFunction | None
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """Of the parameters."""
+        if self.constant_sd is not None:
+            return self.constant_sd.shape[:-1]
+        assert self.log_sd is not None
+        return self.log_sd.batch_shape
+
+    def sd(self, inputs: Tensor) -> Tensor:
+        """Scale (*b, n, n_y) at each sample of the scaled inputs (n, n_u)."""
+        if self.constant_sd is not None:
+            n = inputs.shape[-2]
+            sd = self.constant_sd.unsqueeze(-2)
+            return sd.expand((*sd.shape[:-2], n, sd.shape[-1]))
+        assert self.log_sd is not None
+        return TYPICAL * self.log_sd.mean(inputs).exp()
+
+    def distribution(self, mean: Tensor, sd: Tensor, missing: Tensor | None) -> dist.Distribution:
+        """Of measured outputs (*b, *event) given mean and scale; missing ones are not scored."""
+        nu = self.likelihood.degrees_of_freedom
+        shape = torch.broadcast_shapes(mean.shape, sd.shape)
+        mean, sd = mean.expand(shape), sd.expand(shape)
+        one: dist.Distribution = (
+            dist.Normal(mean, sd) if nu is None else dist.StudentT(nu, mean, sd)
+        )
+        if missing is not None:
+            one = one.mask(~missing)
+        return one
+
+    @property
+    def variance_factor(self) -> float:
+        """Variance over squared scale; infinite for a Student-t of two degrees or fewer."""
+        nu = self.likelihood.degrees_of_freedom
+        if nu is None:
+            return 1.0
+        return nu / (nu - 2.0) if nu > 2 else math.inf

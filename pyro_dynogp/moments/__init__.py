@@ -1,0 +1,7 @@
+"""Moment-matching (assumed-density) filter of a cascade of linear and static layers, compiled."""
+
+from pathlib import Path
+
+from pyro_dynogp._compiled_cache import drop_stale
+
+drop_stale(Path(__file__).parent)

@@ -1,0 +1,359 @@
+r"""One static layer inside the filter: Gaussian moments of f(g) joined to a Gaussian, compiled.
+
+Given a ~ N(m, P) and g = G a + o, the layer appends f(g) to a. With p = G P G' = L L' and the nodes
+xi_q of a quadrature for the standard normal,
+
+    E f = sum w_q f(g_q),  g_q = E g + L xi_q,    Cov(a, f) = P G' L^{-T} sum w_q xi_q f(g_q)',
+    Var f = sum w_q f(g_q) f(g_q)' - E f (E f)' + sum w_q diag(v(g_q)),
+
+exact for a linear f, and positive semi-definite whatever f is. `v` is the variance of the function
+itself given its inducing values. All gradients are written by hand.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from pyro_dynogp.moments.functions import OPTIONS, TABLE, expansion, expansion_adjoint, locate
+
+# Added to the variance of a layer's input: a deterministic one is a Gaussian of this variance.
+FLOOR = 1e-12
+
+
+class Layout(NamedTuple):
+    """Numbers that say how the layers are put together; none of them has a gradient.
+
+    Attributes:
+        step: (n,) index of the distinct step that leads to each sample, -1 for none.
+        channels, outputs: (S,) inputs d and outputs e of each static layer.
+        form: (S,) TABLE or a radial kernel.
+        g_start, f_start: (S + 1,) where the layer's inputs and outputs start among all.
+        nodes: (S, Q, d_max), node_weight: (S, Q), node_count: (S,).
+        share, multiple: (K,) weights and variance multiples of the noise's Gaussian components.
+    """
+
+    step: np.ndarray
+    channels: np.ndarray
+    outputs: np.ndarray
+    form: np.ndarray
+    g_start: np.ndarray
+    f_start: np.ndarray
+    nodes: np.ndarray
+    node_weight: np.ndarray
+    node_count: np.ndarray
+    share: np.ndarray
+    multiple: np.ndarray
+
+
+class Values(NamedTuple):
+    """All numbers with a gradient, of one batch element. N states, A = N + all static outputs.
+
+    Attributes:
+        re, im: (k, N/2) propagators of the k distinct steps.
+        Q: (k, N, N) process noise of each step. gamma: (k, N, E) held static outputs to state.
+        m0: (N,), P0: (N, N) the state at the first sample.
+        G: (D, A) inputs of static layers. offset: (n, D) their known part.
+        table_mean, table_variance: (E, grid) of tabulated functions.
+        low, spacing: (S,) first point and spacing of the grid.
+        weight: (E, M), Z: (S, M, d_max), inverse: (S, d_max), constant: (E,), slope: (E, d_max):
+            of radial expansions.
+        H: (n_y, A) rows of the outputs. y_offset: (n, n_y) their known part.
+        y: (n, n_y) measured, NaN where missing. R: (n, n_y) variance of the noise.
+    """
+
+    re: np.ndarray
+    im: np.ndarray
+    Q: np.ndarray
+    gamma: np.ndarray
+    m0: np.ndarray
+    P0: np.ndarray
+    G: np.ndarray
+    offset: np.ndarray
+    table_mean: np.ndarray
+    table_variance: np.ndarray
+    low: np.ndarray
+    spacing: np.ndarray
+    weight: np.ndarray
+    Z: np.ndarray
+    inverse: np.ndarray
+    constant: np.ndarray
+    slope: np.ndarray
+    H: np.ndarray
+    y_offset: np.ndarray
+    y: np.ndarray
+    R: np.ndarray
+
+
+class Moments(NamedTuple):
+    """What a static layer computes at one sample and its adjoint needs again; S layers of them.
+
+    Attributes:
+        W: (S, A, d) covariance of a with g. centre: (S, d) mean of g. root: (S, d, d) L.
+        f: (S, Q, e) function at the nodes. cross: (S, d, e) sum w xi f'. gain: (S, d, e)
+        regression of f on g.
+    """
+
+    W: np.ndarray
+    centre: np.ndarray
+    root: np.ndarray
+    f: np.ndarray
+    cross: np.ndarray
+    gain: np.ndarray
+
+
+@njit(**OPTIONS)
+def workspace(S, A, d, Q, e):
+    """Empty arrays for `Moments`."""
+    return (
+        np.zeros((S, A, d)),
+        np.zeros((S, d)),
+        np.zeros((S, d, d)),
+        np.zeros((S, Q, e)),
+        np.zeros((S, d, e)),
+        np.zeros((S, d, e)),
+    )
+
+
+@njit(**OPTIONS)
+def _cholesky(p, root):
+    d = p.shape[0]
+    for i in range(d):
+        for j in range(i + 1):
+            total = p[i, j]
+            for k in range(j):
+                total -= root[i, k] * root[j, k]
+            if i == j:
+                root[i, i] = math.sqrt(max(total, 0.0) + FLOOR)
+            else:
+                root[i, j] = total / root[j, j]
+
+
+@njit(**OPTIONS)
+def append(i, time, layout, values, m, P, work, z, weight4, slope4):
+    """Append the outputs of static layer i to the mean m and covariance P, in place."""
+    N = values.m0.shape[0]
+    d = layout.channels[i]
+    e = layout.outputs[i]
+    g0 = layout.g_start[i]
+    f0 = layout.f_start[i]
+    na = N + f0
+    W = work.W[i]
+    centre = work.centre[i]
+    root = work.root[i]
+    gain = work.gain[i]
+    cross = work.cross[i]
+    for c in range(d):
+        G = values.G[g0 + c]
+        centre[c] = values.offset[time, g0 + c]
+        for j in range(na):
+            centre[c] += G[j] * m[j]
+        for k in range(na):
+            total = 0.0
+            for j in range(na):
+                total += P[k, j] * G[j]
+            W[k, c] = total
+    p = np.empty((d, d))
+    for c in range(d):
+        for b in range(c + 1):
+            total = 0.0
+            for j in range(na):
+                total += values.G[g0 + c, j] * W[j, b]
+            p[c, b] = total
+            p[b, c] = total
+    _cholesky(p, root[:d, :d])
+    mean = m[na : na + e]
+    block = P[na : na + e, na : na + e]
+    for a in range(e):
+        mean[a] = 0.0
+        for b in range(e):
+            block[a, b] = 0.0
+        for c in range(d):
+            cross[c, a] = 0.0
+    grid = values.table_mean.shape[1]
+    for q in range(layout.node_count[i]):
+        xi = layout.nodes[i, q]
+        wq = layout.node_weight[i, q]
+        for c in range(d):
+            z[c] = centre[c]
+            for b in range(c + 1):
+                z[c] += root[c, b] * xi[b]
+        f = work.f[i, q]
+        if layout.form[i] == TABLE:
+            k = locate(z[0], values.low[i], values.spacing[i], grid, weight4, slope4)
+            for a in range(e):
+                total = 0.0
+                variance = 0.0
+                for b in range(4):
+                    total += weight4[b] * values.table_mean[f0 + a, k + b]
+                    variance += weight4[b] * values.table_variance[f0 + a, k + b]
+                f[a] = total
+                block[a, a] += wq * variance
+        else:
+            expansion(
+                layout.form[i],
+                z[:d],
+                values.Z[i, :, :d],
+                values.inverse[i, :d],
+                values.weight[f0 : f0 + e],
+                values.constant[f0 : f0 + e],
+                values.slope[f0 : f0 + e],
+                f[:e],
+            )
+        for a in range(e):
+            mean[a] += wq * f[a]
+            for c in range(d):
+                cross[c, a] += wq * xi[c] * f[a]
+    for q in range(layout.node_count[i]):
+        wq = layout.node_weight[i, q]
+        f = work.f[i, q]
+        for a in range(e):
+            for b in range(e):
+                block[a, b] += wq * (f[a] - mean[a]) * (f[b] - mean[b])
+    # gain = L^{-T} cross
+    for a in range(e):
+        for c in range(d - 1, -1, -1):
+            total = cross[c, a]
+            for b in range(c + 1, d):
+                total -= root[b, c] * gain[b, a]
+            gain[c, a] = total / root[c, c]
+        for k in range(na):
+            total = 0.0
+            for c in range(d):
+                total += W[k, c] * gain[c, a]
+            P[k, na + a] = total
+            P[na + a, k] = total
+
+
+@njit(**OPTIONS)
+def append_adjoint(i, time, layout, values, bars, m, P, m_bar, P_bar, work, z, z_bar, w4, s4):
+    """Reverse mode of `append`: m_bar and P_bar (symmetric) lose the layer's outputs, in place."""
+    N = values.m0.shape[0]
+    d = layout.channels[i]
+    e = layout.outputs[i]
+    g0 = layout.g_start[i]
+    f0 = layout.f_start[i]
+    na = N + f0
+    W = work.W[i]
+    root = work.root[i]
+    gain = work.gain[i]
+    cross_bar = np.empty((d, e))
+    W_bar = np.zeros((na, d))
+    root_bar = np.zeros((d, d))
+    centre_bar = np.zeros(d)
+    f_bar = np.empty(e)
+    for a in range(e):
+        for c in range(d):
+            total = 0.0
+            for k in range(na):
+                covariance_bar = 2.0 * P_bar[k, na + a]
+                total += W[k, c] * covariance_bar
+                W_bar[k, c] += covariance_bar * gain[c, a]
+            cross_bar[c, a] = total
+        # cross_bar = L^{-1} gain_bar
+        for c in range(d):
+            total = cross_bar[c, a]
+            for b in range(c):
+                total -= root[c, b] * cross_bar[b, a]
+            cross_bar[c, a] = total / root[c, c]
+    for j in range(d):
+        for k in range(j + 1):
+            for a in range(e):
+                root_bar[j, k] -= gain[j, a] * cross_bar[k, a]
+    grid = values.table_mean.shape[1]
+    centre = work.centre[i]
+    for q in range(layout.node_count[i]):
+        xi = layout.nodes[i, q]
+        wq = layout.node_weight[i, q]
+        f = work.f[i, q]
+        for c in range(d):
+            z_bar[c] = 0.0
+            z[c] = centre[c]
+            for b in range(c + 1):
+                z[c] += root[c, b] * xi[b]
+        for a in range(e):
+            total = m_bar[na + a]
+            for c in range(d):
+                total += cross_bar[c, a] * xi[c]
+            for b in range(e):
+                total += 2.0 * P_bar[na + a, na + b] * (f[b] - m[na + b])
+            f_bar[a] = wq * total
+        if layout.form[i] == TABLE:
+            k = locate(z[0], values.low[i], values.spacing[i], grid, w4, s4)
+            for a in range(e):
+                v_bar = wq * P_bar[na + a, na + a]
+                for b in range(4):
+                    bars.table_mean[f0 + a, k + b] += f_bar[a] * w4[b]
+                    bars.table_variance[f0 + a, k + b] += v_bar * w4[b]
+                    z_bar[0] += s4[b] * (
+                        f_bar[a] * values.table_mean[f0 + a, k + b]
+                        + v_bar * values.table_variance[f0 + a, k + b]
+                    )
+            # The grid itself may move: f depends on (z - low) / spacing.
+            bars.low[i] -= z_bar[0]
+            bars.spacing[i] -= z_bar[0] * (z[0] - values.low[i]) / values.spacing[i]
+        else:
+            expansion_adjoint(
+                layout.form[i],
+                z[:d],
+                values.Z[i, :, :d],
+                values.inverse[i, :d],
+                values.weight[f0 : f0 + e],
+                values.slope[f0 : f0 + e],
+                f_bar,
+                z_bar[:d],
+                bars.Z[i, :, :d],
+                bars.inverse[i, :d],
+                bars.weight[f0 : f0 + e],
+                bars.constant[f0 : f0 + e],
+                bars.slope[f0 : f0 + e],
+            )
+        for c in range(d):
+            centre_bar[c] += z_bar[c]
+            for b in range(c + 1):
+                root_bar[c, b] += z_bar[c] * xi[b]
+    # Cholesky: p_bar = L^{-T} sym(tril(L' L_bar)) L^{-1}, its diagonal halved.
+    p_bar = np.zeros((d, d))
+    for c in range(d):
+        for b in range(c + 1):
+            total = 0.0
+            for k in range(c, d):
+                total += root[k, c] * root_bar[k, b]
+            p_bar[c, b] = 0.5 * total
+            p_bar[b, c] = 0.5 * total
+    for c in range(d):  # columns: p_bar L^{-1}
+        for b in range(d - 1, -1, -1):
+            total = p_bar[c, b]
+            for k in range(b + 1, d):
+                total -= p_bar[c, k] * root[k, b]
+            p_bar[c, b] = total / root[b, b]
+    for b in range(d):  # rows: L^{-T} p_bar
+        for c in range(d - 1, -1, -1):
+            total = p_bar[c, b]
+            for k in range(c + 1, d):
+                total -= root[k, c] * p_bar[k, b]
+            p_bar[c, b] = total / root[c, c]
+    # p = G W, centre = G m + offset, W = P G'.
+    for c in range(d):
+        G = values.G[g0 + c]
+        G_bar = bars.G[g0 + c]
+        bars.offset[time, g0 + c] += centre_bar[c]
+        for j in range(na):
+            total = centre_bar[c] * m[j]
+            for b in range(d):
+                total += p_bar[c, b] * W[j, b]
+                W_bar[j, b] += G[j] * p_bar[c, b]
+            m_bar[j] += centre_bar[c] * G[j]
+            G_bar[j] += total
+    for c in range(d):
+        G = values.G[g0 + c]
+        G_bar = bars.G[g0 + c]
+        for j in range(na):
+            wj = W_bar[j, c]
+            gj = G[j]
+            for k in range(na):
+                G_bar[k] += wj * P[j, k]
+                P_bar[j, k] += 0.5 * (wj * G[k] + gj * W_bar[k, c])

@@ -1,0 +1,165 @@
+r"""Compiled evaluation of static functions inside a recursion, with derivatives.
+
+Two forms. A function of one channel is a table on an even grid, interpolated by cubic convolution
+(Keys 1981, IEEE ASSP 29:1153; the parameter -1/2), held at its ends: any kernel fits, since the
+table is computed outside. A function of several channels is an expansion in a radial kernel,
+
+    f_e(z) = constant_e + slope_e . z + sum_m weight_em kappa(r_m),
+    r_m^2 = sum_c ((z_c - Z_mc) s_c)^2.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+from numba import njit
+
+OPTIONS = {
+    "cache": True,
+    "nogil": True,
+    "error_model": "numpy",
+    "fastmath": {"reassoc", "contract", "nsz", "arcp"},
+}
+
+# Forms of a static function.
+TABLE = 0
+KERNELS = {"rbf": 1, "matern12": 2, "matern32": 3, "matern52": 4}
+
+
+@njit(**OPTIONS)
+def cubic_weights(u, weight, slope):
+    """Weights of the four grid values around a point, and their derivatives by u in [0, 1]."""
+    square = u * u
+    cube = square * u
+    weight[0] = -0.5 * cube + square - 0.5 * u
+    weight[1] = 1.5 * cube - 2.5 * square + 1.0
+    weight[2] = -1.5 * cube + 2.0 * square + 0.5 * u
+    weight[3] = 0.5 * (cube - square)
+    slope[0] = -1.5 * square + 2.0 * u - 0.5
+    slope[1] = 4.5 * square - 5.0 * u
+    slope[2] = -4.5 * square + 4.0 * u + 0.5
+    slope[3] = 1.5 * square - u
+
+
+@njit(**OPTIONS)
+def locate(z, low, spacing, count, weight, slope):
+    """Index of the first of four grid values for z; derivatives by z, zero beyond the ends."""
+    t = (z - low) / spacing
+    last = count - 2.0
+    inside = 1.0
+    if not t > 1.0:  # also where z is NaN
+        t = 1.0
+        inside = 0.0
+    elif t > last:
+        t = last
+        inside = 0.0
+    first = int(t)
+    if first > count - 3:
+        first = count - 3
+    cubic_weights(t - first, weight, slope)
+    for i in range(4):
+        slope[i] *= inside / spacing
+    return first - 1
+
+
+@njit(**OPTIONS)
+def radial(form, square):
+    """Value of kappa and its derivative by r^2, at r^2."""
+    if form == 1:
+        value = math.exp(-0.5 * square)
+        return value, -0.5 * value
+    r = math.sqrt(square + 1e-30)
+    if form == 2:
+        value = math.exp(-r)
+        return value, -0.5 * value / r
+    if form == 3:
+        a = math.sqrt(3.0)
+        value = math.exp(-a * r)
+        return (1.0 + a * r) * value, -1.5 * value
+    a = math.sqrt(5.0)
+    value = math.exp(-a * r)
+    return (1.0 + a * r + 5.0 / 3.0 * square) * value, -5.0 / 6.0 * (1.0 + a * r) * value
+
+
+@njit(**OPTIONS)
+def expansion(form, z, Z, inverse, weight, constant, slope, f):
+    """Write the outputs f (e,) of a radial expansion at z (d,)."""
+    e = f.shape[0]
+    d = z.shape[0]
+    for a in range(e):
+        f[a] = constant[a]
+        for c in range(d):
+            f[a] += slope[a, c] * z[c]
+    for m in range(Z.shape[0]):
+        square = 0.0
+        for c in range(d):
+            t = (z[c] - Z[m, c]) * inverse[c]
+            square += t * t
+        value, _ = radial(form, square)
+        for a in range(e):
+            f[a] += weight[a, m] * value
+
+
+@njit(**OPTIONS)
+def expansion_adjoint(
+    form,
+    z,
+    Z,
+    inverse,
+    weight,
+    slope,
+    f_bar,
+    z_bar,
+    Z_bar,
+    inverse_bar,
+    weight_bar,
+    constant_bar,
+    slope_bar,
+):
+    """Add the gradients of a radial expansion at z, given those of its outputs."""
+    e = f_bar.shape[0]
+    d = z.shape[0]
+    for a in range(e):
+        constant_bar[a] += f_bar[a]
+        for c in range(d):
+            slope_bar[a, c] += f_bar[a] * z[c]
+            z_bar[c] += f_bar[a] * slope[a, c]
+    for m in range(Z.shape[0]):
+        square = 0.0
+        for c in range(d):
+            t = (z[c] - Z[m, c]) * inverse[c]
+            square += t * t
+        value, derivative = radial(form, square)
+        total = 0.0
+        for a in range(e):
+            weight_bar[a, m] += f_bar[a] * value
+            total += f_bar[a] * weight[a, m]
+        square_bar = 2.0 * total * derivative
+        for c in range(d):
+            difference = z[c] - Z[m, c]
+            t = square_bar * inverse[c] * inverse[c] * difference
+            z_bar[c] += t
+            Z_bar[m, c] -= t
+            inverse_bar[c] += square_bar * difference * difference * inverse[c]
+
+
+@lru_cache
+def gauss_hermite(channels: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes (Q, d) and weights (Q,) for the standard normal of d channels.
+
+    One channel: 11 Gauss-Hermite nodes; two: 5 x 5; three and four: products of three nodes; from
+    five on the third-degree cubature of 2 d nodes, whose cost does not grow exponentially.
+    """
+    if channels >= 5:
+        eye = math.sqrt(channels) * np.eye(channels)
+        return np.concatenate([eye, -eye]), np.full(2 * channels, 0.5 / channels)
+    count = {1: 11, 2: 5, 3: 3, 4: 3}[channels]
+    x, w = np.polynomial.hermite_e.hermegauss(count)
+    w = w / w.sum()
+    nodes = np.stack([g.ravel() for g in np.meshgrid(*[x] * channels, indexing="ij")], -1)
+    weights = np.prod(
+        np.stack([g.ravel() for g in np.meshgrid(*[w] * channels, indexing="ij")], -1), -1
+    )
+    return nodes, weights

@@ -1,0 +1,270 @@
+r"""What the filter says about layers and outputs: smoothed trajectories, predictions, last state.
+
+The smoother runs backwards with the gradient lambda and the negative Hessian Lambda of the
+log-density of later data by the state (Bryson & Frazier 1963): the smoothed mean is m + P lambda
+and the covariance P - P Lambda P. Nothing is inverted, so that layers without process noise, whose
+covariance is singular, are no special case. Static layers act through their regression gain.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from pyro_dynogp.moments.blocks import append
+from pyro_dynogp.moments.functions import OPTIONS
+from pyro_dynogp.moments.recursion import (
+    SEGMENT,
+    covary,
+    dot,
+    enter,
+    measure,
+    noise_terms,
+    scratch,
+    update,
+)
+
+
+@njit(**OPTIONS)
+def _quadratic(P, h, c):
+    covary(P, h, c)
+    return dot(h, c)
+
+
+@njit(**OPTIONS)
+def predict_ahead(layout, values, horizon):
+    """Mean and variance (n, n_y) of the noise-free outputs given data up to `horizon` before.
+
+    Earlier targets than `horizon` are predicted from the first state without data.
+    """
+    n = layout.step.shape[0]
+    n_y = values.y.shape[1]
+    N = values.m0.shape[0]
+    A = values.G.shape[1]
+    S = layout.channels.shape[0]
+    mean = np.empty((n, n_y))
+    variance = np.empty((n, n_y))
+    m = np.zeros(A)
+    P = np.zeros((A, A))
+    m[:N] = values.m0
+    P[:N, :N] = values.P0
+    ahead_m = m.copy()
+    ahead_P = P.copy()
+    work, T, z, w4, s4 = scratch(layout, values)
+    c = np.empty(A)
+    for target in range(min(horizon, n)):  # no data yet
+        if target > 0:
+            enter(target, layout, values, ahead_m, ahead_P, T)
+        for i in range(S):
+            append(i, target, layout, values, ahead_m, ahead_P, work, z, w4, s4)
+        for o in range(n_y):
+            mean[target, o] = dot(values.H[o], ahead_m) + values.y_offset[target, o]
+            variance[target, o] = _quadratic(ahead_P, values.H[o], c)
+    for time in range(n - horizon):
+        if time > 0:
+            enter(time, layout, values, m, P, T)
+        for i in range(S):
+            append(i, time, layout, values, m, P, work, z, w4, s4)
+        measure(time, layout, values, m, P, c)
+        ahead_m[:] = m
+        ahead_P[:] = P
+        for target in range(time + 1, time + horizon + 1):
+            enter(target, layout, values, ahead_m, ahead_P, T)
+            for i in range(S):
+                append(i, target, layout, values, ahead_m, ahead_P, work, z, w4, s4)
+        target = time + horizon
+        for o in range(n_y):
+            mean[target, o] = dot(values.H[o], ahead_m) + values.y_offset[target, o]
+            variance[target, o] = _quadratic(ahead_P, values.H[o], c)
+    return mean, variance
+
+
+@njit(**OPTIONS)
+def _before_outputs(time, layout, values, bar, L, work, C, alphas, betas, m, P, t):
+    """Take lambda (A,) and Lambda (A, A) back over the outputs of a sample, undone in m and P."""
+    A = bar.shape[0]
+    for o in range(values.y.shape[1] - 1, -1, -1):
+        if math.isnan(values.y[time, o]):
+            continue
+        h = values.H[o]
+        c = C[o]
+        update(P, m, c, -alphas[o], -betas[o])
+        along = dot(c, bar)
+        for j in range(A):
+            bar[j] += (alphas[o] - betas[o] * along) * h[j]
+        covary(L, c, t)
+        both = betas[o] * (1.0 + betas[o] * dot(c, t))
+        for j in range(A):
+            for k in range(A):
+                L[j, k] += both * h[j] * h[k] - betas[o] * (h[j] * t[k] + t[j] * h[k])
+
+
+@njit(**OPTIONS)
+def _before_layer(i, layout, values, bar, L, work, row):
+    """Take lambda and Lambda back over static layer i: its outputs lean on what they come from."""
+    N = values.m0.shape[0]
+    A = bar.shape[0]
+    na = N + layout.f_start[i]
+    for a in range(layout.outputs[i]):
+        q = na + a
+        for j in range(na):
+            row[j] = 0.0
+            for c in range(layout.channels[i]):
+                row[j] += work.gain[i, c, a] * values.G[layout.g_start[i] + c, j]
+        for j in range(na):
+            bar[j] += row[j] * bar[q]
+        bar[q] = 0.0
+        # Later outputs of the same layer keep their entries until it is their turn.
+        for k in range(A):
+            t = L[q, k]
+            for j in range(na):
+                L[j, k] += row[j] * t
+        for k in range(A):
+            t = L[k, q]
+            for j in range(na):
+                L[k, j] += row[j] * t
+        for k in range(A):
+            L[q, k] = 0.0
+            L[k, q] = 0.0
+
+
+@njit(**OPTIONS)
+def smooth(layout, values, rows, means, covariances):
+    """Smoothed mean (n, A) of [x; f] and variance (n, r) of the rows (r, A) of it.
+
+    means, covariances: what `recursion.run` kept at the segments.
+    """
+    n = layout.step.shape[0]
+    n_y = values.y.shape[1]
+    N = values.m0.shape[0]
+    A = values.G.shape[1]
+    E = A - N
+    S = layout.channels.shape[0]
+    pairs = N // 2
+    mean = np.empty((n, A))
+    variance = np.empty((n, rows.shape[0]))
+    m = np.zeros(A)
+    P = np.zeros((A, A))
+    bar = np.zeros(A)
+    L = np.zeros((A, A))
+    work, T, z, w4, s4 = scratch(layout, values)
+    moved = np.empty((N, A))
+    C = np.zeros((n_y, A))
+    alphas = np.zeros(n_y)
+    betas = np.zeros(n_y)
+    c = np.empty(A)
+    t = np.empty(A)
+    before_m = np.empty((SEGMENT, N))
+    before_P = np.empty((SEGMENT, N, N))
+    for segment in range(means.shape[0] - 1, -1, -1):
+        first = segment * SEGMENT
+        last = min(n, first + SEGMENT)
+        m[:N] = means[segment]
+        P[:N, :N] = covariances[segment]
+        for time in range(first, last):
+            if time > first:
+                enter(time, layout, values, m, P, T)
+            before_m[time - first] = m[:N]
+            before_P[time - first] = P[:N, :N]
+            for i in range(S):
+                append(i, time, layout, values, m, P, work, z, w4, s4)
+            measure(time, layout, values, m, P, c)
+        for time in range(last - 1, first - 1, -1):
+            m[:N] = before_m[time - first]
+            P[:N, :N] = before_P[time - first]
+            for i in range(S):
+                append(i, time, layout, values, m, P, work, z, w4, s4)
+            for o in range(n_y):
+                y = values.y[time, o]
+                if math.isnan(y):
+                    continue
+                covary(P, values.H[o], C[o])
+                r = y - dot(values.H[o], m) - values.y_offset[time, o]
+                _, alphas[o], betas[o] = noise_terms(
+                    r, dot(values.H[o], C[o]), values.R[time, o], layout.share, layout.multiple
+                )
+                update(P, m, C[o], alphas[o], betas[o])
+            if time < n - 1 and layout.step[time + 1] >= 0:
+                k = layout.step[time + 1]
+                re = values.re[k]
+                im = values.im[k]
+                gamma = values.gamma[k]
+                # lambda <- F' lambda, Lambda <- F' Lambda F with F = [Phi gamma].
+                for f in range(E):
+                    total = 0.0
+                    for j in range(N):
+                        total += gamma[j, f] * bar[j]
+                    bar[N + f] = total
+                for i in range(N):
+                    for j in range(pairs):
+                        x = L[i, j]
+                        w = L[i, pairs + j]
+                        moved[i, j] = re[j] * x + im[j] * w
+                        moved[i, pairs + j] = re[j] * w - im[j] * x
+                    for f in range(E):
+                        total = 0.0
+                        for j in range(N):
+                            total += L[i, j] * gamma[j, f]
+                        moved[i, N + f] = total
+                for i in range(A):
+                    for f in range(E):
+                        total = 0.0
+                        for j in range(N):
+                            total += gamma[j, f] * moved[j, i]
+                        L[N + f, i] = total
+                    for j in range(pairs):
+                        x = moved[j, i]
+                        w = moved[pairs + j, i]
+                        L[j, i] = re[j] * x + im[j] * w
+                        L[pairs + j, i] = re[j] * w - im[j] * x
+                for j in range(pairs):
+                    x = bar[j]
+                    w = bar[pairs + j]
+                    bar[j] = re[j] * x + im[j] * w
+                    bar[pairs + j] = re[j] * w - im[j] * x
+            covary(P, bar, c)
+            for j in range(A):
+                mean[time, j] = m[j] + c[j]
+            for row in range(rows.shape[0]):
+                covary(P, rows[row], c)
+                variance[time, row] = max(dot(rows[row], c) - _quadratic(L, c, t), 0.0)
+            _before_outputs(time, layout, values, bar, L, work, C, alphas, betas, m, P, t)
+            for i in range(S - 1, -1, -1):
+                _before_layer(i, layout, values, bar, L, work, t)
+    return mean, variance
+
+
+@njit(**OPTIONS)
+def innovate(layout, values):
+    """Innovations y - E[y] (n, n_y) and their variances, one step ahead; NaN where missing."""
+    n = layout.step.shape[0]
+    n_y = values.y.shape[1]
+    N = values.m0.shape[0]
+    A = values.G.shape[1]
+    innovation = np.full((n, n_y), np.nan)
+    variance = np.full((n, n_y), np.nan)
+    m = np.zeros(A)
+    P = np.zeros((A, A))
+    m[:N] = values.m0
+    P[:N, :N] = values.P0
+    work, T, z, w4, s4 = scratch(layout, values)
+    c = np.empty(A)
+    for time in range(n):
+        enter(time, layout, values, m, P, T)
+        for i in range(layout.channels.shape[0]):
+            append(i, time, layout, values, m, P, work, z, w4, s4)
+        for o in range(n_y):
+            y = values.y[time, o]
+            if math.isnan(y):
+                continue
+            h = values.H[o]
+            covary(P, h, c)
+            r = y - dot(h, m) - values.y_offset[time, o]
+            s = dot(h, c)
+            innovation[time, o] = r
+            variance[time, o] = s + values.R[time, o]
+            _, alpha, beta = noise_terms(r, s, values.R[time, o], layout.share, layout.multiple)
+            update(P, m, c, alpha, beta)
+    return innovation, variance

@@ -1,0 +1,357 @@
+"""Simulation, prediction, forecast and layers of a fitted cascade."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pyro_dynogp._errors import invalid
+from pyro_dynogp._tensors import as_tensor
+from pyro_dynogp.lti.grid import TimeGrid, time_grid
+from pyro_dynogp.models.cascade import CascadeSystem, DynamicSystem, scaled_inputs
+from pyro_dynogp.models.collapsed import Assembly, assemble
+from pyro_dynogp.moments import recursion, smoothing
+from pyro_dynogp.moments.problem import FilterProblem, each
+from pyro_dynogp.parallel import seeded
+from pyro_dynogp.prediction.beginning import beginning, cascade_of
+from pyro_dynogp.prediction.clock import gap_between
+from pyro_dynogp.prediction.prediction import Prediction
+from pyro_dynogp.prediction.sampling import (
+    Drawn,
+    JointState,
+    Randomness,
+    Switches,
+    draw_layers,
+)
+from pyro_dynogp.record import Record
+
+if TYPE_CHECKING:
+    from pyro_dynogp.inference.result import Fit
+
+
+def simulate(fit: Fit, record: Record, process_noise: bool, samples: int, seed: int) -> Prediction:
+    """See `Fit.simulate`."""
+    _one(fit, record)
+    with torch.no_grad():
+        system = cascade_of(fit).begin(fit.system, {})
+        inputs = scaled_inputs(fit.scaling, record)
+        grid = time_grid(record.time)
+        problem = assemble(system, grid, inputs, process_noise=process_noise).problem
+        start = JointState(problem.m0, problem.P0)  # nothing is known of past inputs
+        return _forward(
+            fit, record, grid, inputs, start, process_noise, samples, seed, "simulation"
+        )
+
+
+def forecast(
+    fit: Fit, past: Record, future: Record, process_noise: bool, samples: int, seed: int
+) -> Prediction:
+    """See `Fit.forecast`."""
+    _one(fit, past)
+    _one(fit, future)
+    gap = gap_between(past, future)
+    if not past.n_outputs:
+        raise invalid("past", expected="outputs to start from", got="none")
+    with torch.no_grad():
+        # One grid over the past and the first time of the future: the filter carries the state.
+        time = np.append(past.time, past.time[-1] + gap)
+        u = scaled_inputs(fit.scaling, past)
+        ahead = scaled_inputs(fit.scaling, future)
+        both = torch.cat([u, ahead[:1]])
+        y = _scaled(fit, past)
+        y = torch.cat([y, torch.full_like(y[:1], torch.nan)])
+        assembly = assemble(beginning(fit, past), time_grid(time), both)
+        start = filtered_state(assembly, y)
+        grid = time_grid(future.time)
+        return _forward(fit, future, grid, ahead, start, process_noise, samples, seed, "forecast")
+
+
+def filtered_state(assembly: Assembly, y: Tensor) -> JointState:
+    """State of all dynamic layers at the last time given scaled outputs y (n, n_y)."""
+    problem = assembly.with_outputs(y)
+    elements, batch = problem.elements()
+    N = problem.m0.shape[-1]
+    ends = each(lambda b: recursion.run(problem.layout, elements[b]), len(elements))
+    m = torch.from_numpy(np.stack([end[3][:N] for end in ends])).reshape(*batch, N)
+    P = torch.from_numpy(np.stack([end[4][:N, :N] for end in ends])).reshape(*batch, N, N)
+    return JointState(assembly.known_state + m, P)
+
+
+def predict(fit: Fit, record: Record, horizon: int, samples: int, seed: int) -> Prediction:
+    """See `Fit.predict`."""
+    _one(fit, record)
+    if not isinstance(horizon, int) or horizon < 1:
+        raise invalid("horizon", expected="a whole number >= 1", got=repr(horizon))
+    if not record.n_outputs:
+        raise invalid("record", expected="outputs to predict from", got="none")
+    with torch.no_grad():
+        inputs = scaled_inputs(fit.scaling, record)
+        assembly = assemble(beginning(fit, record), time_grid(record.time), inputs)
+        problem = assembly.with_outputs(_scaled(fit, record))
+        elements, _ = problem.elements()
+        found = each(
+            lambda b: smoothing.predict_ahead(problem.layout, elements[b], horizon), len(elements)
+        )
+        scale, shift = _units(fit)
+        mean = shift + scale * np.stack([m for m, _ in found])
+        variance = scale**2 * np.stack([v for _, v in found])
+        generator = np.random.default_rng(seed)
+        noise = scale**2 * _noise_variance(fit.system, inputs, len(mean), generator)
+    parts = {
+        "parameters": mean.var(0),
+        "state": variance.mean(0),
+        "measurement noise": noise.mean(0),
+    }
+
+    def draw() -> np.ndarray:
+        which = generator.integers(len(mean), size=samples)
+        sd = np.sqrt(variance + noise)
+        return mean[which] + sd[which] * generator.standard_normal((samples, *mean.shape[1:]))
+
+    kind = f"{horizon}-step prediction"
+    names = fit.scaling.output_names
+    return Prediction(record.time, names, mean, variance, noise, parts, draw, kind)
+
+
+@dataclass(frozen=True)
+class LayerTrajectory:
+    """Posterior of a layer's output along a record.
+
+    Attributes:
+        name: of the layer. time: (n,).
+        mean, sd: (n, w), over state and parameters, in the layer's own scale (inputs and outputs of
+            the cascade have unit standard deviation there).
+        draw_mean, draw_sd: (S, n, w), the same for each posterior draw of the parameters.
+    """
+
+    name: str
+    time: np.ndarray
+    mean: np.ndarray
+    sd: np.ndarray
+    draw_mean: np.ndarray
+    draw_sd: np.ndarray
+
+
+def layers(fit: Fit, record: Record) -> dict[str, LayerTrajectory]:
+    """Smoothed trajectories of all layers given a record's inputs and outputs."""
+    _one(fit, record)
+    with torch.no_grad():
+        inputs = scaled_inputs(fit.scaling, record)
+        assembly = assemble(beginning(fit, record), time_grid(record.time), inputs)
+        y = _scaled(fit, record) if record.n_outputs else None
+        problem = assembly.problem if y is None else assembly.with_outputs(y)
+        return smoothed_layers(assembly, problem, record.time)
+
+
+def smoothed_layers(
+    assembly: Assembly, problem: FilterProblem, time: np.ndarray
+) -> dict[str, LayerTrajectory]:
+    """Mean and sd of every signal of a cascade given the outputs of the problem."""
+    elements, batch = problem.elements()
+    A = problem.G.shape[-1]
+    names, widths, rows = [], [], []
+    for name, signal in assembly.signals.items():
+        if signal.rows is None:
+            continue
+        names.append(name)
+        widths.append(signal.rows.shape[-2])
+        rows.append(signal.rows.expand(*batch, widths[-1], A).reshape(-1, widths[-1], A))
+    nothing = torch.zeros(len(elements), 0, A, dtype=torch.float64)
+    joined = (torch.cat(rows, -2) if rows else nothing).contiguous().numpy()
+
+    def one(b: int) -> tuple[np.ndarray, np.ndarray]:
+        _, means, covariances, _, _ = recursion.run(problem.layout, elements[b])
+        mean, variance = smoothing.smooth(
+            problem.layout, elements[b], joined[b], means, covariances
+        )
+        return mean @ joined[b].T, variance
+
+    found = each(one, len(elements))
+    mean = np.stack([m for m, _ in found])
+    sd = np.sqrt(np.stack([v for _, v in found]))
+    out, start = {}, 0
+    for name, signal in assembly.signals.items():
+        n, w = signal.known.shape[-2:]
+        known = signal.known.expand(*batch, n, w).reshape(-1, n, w).numpy()
+        if signal.rows is None:
+            draw_mean, draw_sd = known, np.zeros_like(known)
+        else:
+            own = slice(start, start + w)
+            draw_mean, draw_sd = known + mean[..., own], sd[..., own]
+            start += w
+        if name == "inputs":
+            continue
+        total = np.sqrt((draw_sd**2).mean(0) + draw_mean.var(0))
+        out[name] = LayerTrajectory(name, time, draw_mean.mean(0), total, draw_mean, draw_sd)
+    return out
+
+
+@dataclass(frozen=True)
+class StaticBand:
+    """A static layer's function over the range of its input.
+
+    Attributes:
+        name: of the layer. channel: which input varies; others are at their mean.
+        x: (m,). mean, sd: (m, e) over parameters and the function itself.
+        inputs: (n,) posterior means of the layer's input along the record: where there are data.
+    """
+
+    name: str
+    channel: int
+    x: np.ndarray
+    mean: np.ndarray
+    sd: np.ndarray
+    inputs: np.ndarray
+
+
+def static_function(fit: Fit, name: str, record: Record, channel: int, points: int) -> StaticBand:
+    """See `Fit.static_function`."""
+    wires = {one.name: one for one in cascade_of(fit).wires}
+    layer = fit.system.layer(name)
+    if isinstance(layer, DynamicSystem):
+        raise invalid("name", expected="a static layer", got=f"{name!r}, a dynamic one")
+    one = wires[name]
+    if not 0 <= channel < one.channels:
+        raise invalid("channel", expected=f"0 to {one.channels - 1}", got=repr(channel))
+    found = {k: v.mean for k, v in layers(fit, record).items()}
+    found["inputs"] = scaled_inputs(fit.scaling, record).numpy()
+    seen = np.concatenate([found[source] for source in one.sources], -1)
+    low, high = seen[:, channel].min(), seen[:, channel].max()
+    margin = 0.1 * (high - low)
+    x = np.linspace(low - margin, high + margin, points)
+    at = np.tile(seen.mean(0), (points, 1))
+    at[:, channel] = x
+    with torch.no_grad():
+        mean, variance = layer.function.moments(as_tensor(at))
+    mean_, variance_ = mean.numpy(), variance.numpy()
+    mean_ = mean_.reshape(-1, *mean_.shape[-2:])
+    variance_ = variance_.reshape(-1, *variance_.shape[-2:])
+    sd = np.sqrt(variance_.mean(0) + mean_.var(0))
+    return StaticBand(name, channel, x, mean_.mean(0), sd, seen[:, channel])
+
+
+def _forward(
+    fit: Fit,
+    record: Record,
+    grid: TimeGrid,
+    inputs: Tensor,
+    start: JointState,
+    process_noise: bool,
+    samples: int,
+    seed: int,
+    kind: str,
+) -> Prediction:
+    """Draw `samples` trajectories over all posterior draws; each gives a Gaussian component."""
+    system = fit.system
+    batch = system.batch_shape
+    each_draw = max(2, -(-samples // max(1, batch.numel())))
+    shape = torch.Size((each_draw, *batch))
+    with seeded(seed):
+        random = Randomness.draw(system, len(grid), shape)
+    scale, shift = _units(fit)
+    on = Switches.all_on(system, process_noise)
+
+    def at(switches: Switches) -> Drawn:
+        return draw_layers(system, grid, inputs, start, random, switches)
+
+    full = at(on)
+    mean = shift + scale * _flat(full.mean)
+    variance = scale**2 * _flat(full.variance)
+    generator = np.random.default_rng(seed)
+    noise = scale**2 * _noise_variance(system, inputs, len(mean), generator)
+    parts = _decompose(system, at, on, scale)
+    parts["measurement noise"] = noise.mean(0)
+    # A joint sample of the last layer: its own draw where it is dynamic.
+    last = system.wires[-1].name
+    drawn = mean
+    if isinstance(system.layers[-1], DynamicSystem):
+        level = 0.0 if system.offset is None else system.offset.unsqueeze(-2)
+        drawn = shift + scale * _flat(full.signals[last] + level)
+
+    def draw() -> np.ndarray:
+        own = np.zeros_like(variance) if drawn is not mean else variance
+        y = drawn + np.sqrt(own + noise) * generator.standard_normal(mean.shape)
+        return y[generator.permutation(len(y))[:samples]]
+
+    names = fit.scaling.output_names
+    return Prediction(record.time, names, mean, variance, noise, parts, draw, kind)
+
+
+def _decompose(
+    system: CascadeSystem, at: Callable[[Switches], Drawn], on: Switches, scale: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Share of the variance by cause: what each adds when the causes are switched on in turn.
+
+    The same random numbers serve all of them; the shares add up by construction.
+    """
+    parts: dict[str, np.ndarray] = {}
+    total: np.ndarray | float = 0.0
+
+    def add(cause: str, switches: Switches, whole: bool = False) -> None:
+        nonlocal total
+        drawn = at(switches)
+        now = drawn.mean.reshape(-1, *drawn.mean.shape[-2:]).var(0, correction=0)
+        if whole:
+            now = now + drawn.variance.reshape(-1, *drawn.mean.shape[-2:]).mean(0)
+        value = scale**2 * now.numpy()
+        parts[cause] = value - total
+        total = value
+
+    current = Switches(False, frozenset(), False)
+    add("parameters", current)
+    current = replace(current, initial_state=True)
+    add("initial state", current)
+    for one, layer in zip(system.wires, system.layers, strict=True):
+        last = one.name == system.wires[-1].name
+        if isinstance(layer, DynamicSystem) and one.name in on.process_noise:
+            current = replace(current, process_noise=current.process_noise | {one.name})
+            add(f"process noise of {one.name}", current, whole=last)
+    add("static functions", on, whole=True)
+    return parts
+
+
+def _flat(x: Tensor) -> np.ndarray:
+    """(*shape, n, w) to (S, n, w)."""
+    return x.reshape(-1, *x.shape[-2:]).numpy()
+
+
+def _noise_variance(
+    system: CascadeSystem, inputs: Tensor, count: int, generator: np.random.Generator
+) -> np.ndarray:
+    """Variance (count, n, n_y) of the noise for each component; a Student-t's is drawn."""
+    sd = system.noise.sd(inputs)
+    flat = sd.reshape(-1, *sd.shape[-2:]).numpy()
+    variance = np.broadcast_to(flat, (len(flat), *flat.shape[1:])) ** 2
+    variance = np.tile(variance, (-(-count // len(variance)), 1, 1))[:count]
+    nu = system.noise.likelihood.degrees_of_freedom
+    if nu is not None:
+        variance = variance * (0.5 * nu / generator.standard_gamma(0.5 * nu, variance.shape))
+    return variance
+
+
+def _units(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+    return fit.scaling.output_scale, fit.scaling.output_offset
+
+
+def _scaled(fit: Fit, record: Record) -> Tensor:
+    scale, shift = _units(fit)
+    return torch.tensor((record.outputs - shift) / scale, dtype=torch.float64)
+
+
+def _one(fit: Fit, record: Record) -> None:
+    if not isinstance(record, Record):
+        raise invalid(
+            "record",
+            expected="one Record",
+            got=type(record).__name__,
+            advice="Predict several records one after the other.",
+        )
+    fit.model.check(record)
+
+
+Layers = Mapping[str, LayerTrajectory]
