@@ -4,6 +4,8 @@ import os
 
 from pyro_dynogp._compiled_cache import drop_stale
 
+FUTURE = 4e9
+
 
 def package(tmp_path, source_time: float, kept_time: float):
     cache = tmp_path / "__pycache__"
@@ -16,7 +18,8 @@ def package(tmp_path, source_time: float, kept_time: float):
         (cache / "b.cpython-311.pyc", 900.0),
     ):
         path.write_bytes(b"x")
-        os.utime(path, (time, time))
+        # Later than the library's own sources, which count too.
+        os.utime(path, (FUTURE + time, FUTURE + time))
     return cache
 
 

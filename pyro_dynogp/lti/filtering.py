@@ -10,13 +10,14 @@ import torch
 from numba import njit
 from torch import Tensor
 
+from pyro_dynogp._compiled_cache import OPTIONS
 from pyro_dynogp._errors import invalid
 from pyro_dynogp.lti import recursions
 from pyro_dynogp.lti.primitives import array, flatten_batch
 from pyro_dynogp.lti.semiseparable import SemiseparableCovariance
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**OPTIONS)
 def _emit(F, S, lam, h, k0, age, j, out_mean, out_variance):
     """Mean and variance of every output at an age [s] after the state F, S; F may be empty."""
     pairs = lam.shape[0]
@@ -37,7 +38,7 @@ def _emit(F, S, lam, h, k0, age, j, out_mean, out_variance):
         out_variance[j * h.shape[0] + a] = k0[a] - explained
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**OPTIONS)
 def _k_step(re, im, step, lam, time, h, g, k0, v, S0, Y, horizon):
     """Means (b, N) and variances (b, N) of the noise-free outputs given samples k steps before."""
     batch, rows = v.shape

@@ -24,20 +24,13 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-# Reassociation lets the compiler use vector instructions in sums; infinities must stay exact.
-# Division by a pivot of zero gives infinity, which the caller tells from a covariance.
-_OPTIONS = {
-    "cache": True,
-    "nogil": True,
-    "error_model": "numpy",
-    "fastmath": {"reassoc", "contract", "nsz", "arcp"},
-}
+from pyro_dynogp._compiled_cache import OPTIONS
 
 # Rows between checkpoints of an adjoint: its matrices stay in the processor's cache.
 _SEGMENT = 64
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _rotate_columns(S, re, im):
     """S <- S Phi' in place."""
     pairs = re.shape[0]
@@ -49,7 +42,7 @@ def _rotate_columns(S, re, im):
             S[i, pairs + j] = im[j] * a + re[j] * b
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _rotate_rows(S, re, im):
     """S <- Phi S in place."""
     pairs = re.shape[0]
@@ -63,7 +56,7 @@ def _rotate_rows(S, re, im):
             S[pairs + i, j] = q * a + r * b
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _dot(a, b):
     total = 0.0
     for i in range(a.shape[0]):
@@ -71,7 +64,7 @@ def _dot(a, b):
     return total
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _times(S, x, out):
     """Write S x to out (S symmetric: sums run down the columns, which vectorises)."""
     n = x.shape[0]
@@ -83,7 +76,7 @@ def _times(S, x, out):
             out[i] += S[j, i] * xj
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _add_outer(S, a, x, y):
     """S <- S + a x y'."""
     n = x.shape[0]
@@ -93,7 +86,7 @@ def _add_outer(S, a, x, y):
             S[i, j] += c * y[j]
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _factor_row(S, re, im, k, h, g, k0, v, s, e):
     """Advance the explained covariance S over one row; e is written, the variance p returned."""
     if k >= 0:
@@ -107,7 +100,7 @@ def _factor_row(S, re, im, k, h, g, k0, v, s, e):
     return p
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def factor(re, im, step, out, h, g, k0, v, S0):
     """Predictive covariances e (B, N, J) and variances p (B, N), and the last S (B, J, J).
 
@@ -130,7 +123,7 @@ def factor(re, im, step, out, h, g, k0, v, S0):
     return e, p, S_end
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _add_step_gradient(M, Q, re_bar, im_bar):
     """Gradient of <M, Phi Q'> with respect to the numbers phi: add it to re_bar and im_bar."""
     pairs = re_bar.shape[0]
@@ -140,7 +133,7 @@ def _add_step_gradient(M, Q, re_bar, im_bar):
         im_bar[i] += _dot(M[k], Q[i]) - _dot(M[i], Q[k])
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def factor_adjoint(re, im, step, out, h, g, k0, v, S0, e_bar, p_bar, S_end_bar):
     """Reverse mode of `factor`: gradients for re, im, h, g, k0, v, S0."""
     batch, n = v.shape
@@ -224,14 +217,14 @@ def factor_adjoint(re, im, step, out, h, g, k0, v, S0, e_bar, p_bar, S_end_bar):
     return re_bar, im_bar, h_bar, g_bar, k0_bar, v_bar, S0_bar
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _advance(F, re, im, k):
     """F <- Phi F in place, F (J, R)."""
     if k >= 0:
         _rotate_rows(F, re[k], im[k])
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def lower(re, im, step, out, h, w, X, solve):
     """Strictly lower product M X, or the solution Z of (I + M) Z = X, M = tril(h' Phi w, -1)."""
     batch, n, R = X.shape
@@ -259,7 +252,7 @@ def lower(re, im, step, out, h, w, X, solve):
     return Z
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def upper(re, im, step, out, h, w, X, solve):
     """Transposed twin of `lower`: M' X, or the solution Z of (I + M)' Z = X."""
     batch, n, R = X.shape
@@ -289,7 +282,7 @@ def upper(re, im, step, out, h, w, X, solve):
     return Z
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def lower_gradient(re, im, step, out, h, w, X, Z_bar):
     """Gradients of <Z_bar, M X> with respect to re, im, h and w."""
     batch, n, R = X.shape
@@ -340,7 +333,7 @@ def lower_gradient(re, im, step, out, h, w, X, Z_bar):
     return re_bar, im_bar, h_bar, w_bar
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _information_row(info, re, back, k, h, e, inverse, u):
     """Move the information matrix of later rows across one row; return e' info e (before)."""
     _times(info, e, u)
@@ -357,7 +350,7 @@ def _information_row(info, re, back, k, h, e, inverse, u):
     return kappa
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def later_information(re, im, step, out, h, e, d):
     """kappa_n = e_n' Lambda_n e_n, Lambda_n the information of the rows after n on the state at n.
 
@@ -378,7 +371,7 @@ def later_information(re, im, step, out, h, e, d):
     return kappa
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def later_information_adjoint(re, im, step, out, h, e, d, kappa_bar):
     """Reverse mode of `later_information`: gradients for re, im, h, e and d."""
     batch, n = d.shape

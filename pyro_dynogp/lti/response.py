@@ -17,6 +17,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
+from pyro_dynogp._compiled_cache import OPTIONS
 from pyro_dynogp._errors import invalid
 from pyro_dynogp._tensors import as_tensor
 from pyro_dynogp.lti.fused import propagators
@@ -24,10 +25,8 @@ from pyro_dynogp.lti.grid import TimeGrid, time_grid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.primitives import array, flatten_batch, run
 
-_OPTIONS = {"cache": True, "nogil": True, "fastmath": {"reassoc", "contract", "nsz"}}
 
-
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _scan(phi, gamma, step, B, c, u, x0):
     """Outputs (b, n, n_y) and modal states (b, n, P) for inputs (b, n, n_u)."""
     batch, n, n_u = u.shape
@@ -57,7 +56,7 @@ def _scan(phi, gamma, step, B, c, u, x0):
     return y, states
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _scan_adjoint(phi, gamma, step, B, c, u, states, y_bar, end_bar):
     """Reverse mode of `_scan`; complex gradients are dL/dRe + i dL/dIm (torch's convention)."""
     batch, n, n_u = u.shape

@@ -18,7 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from pyro_dynogp.moments.functions import OPTIONS, TABLE, expansion, expansion_adjoint, locate
+from pyro_dynogp._compiled_cache import OPTIONS
+from pyro_dynogp.moments.functions import TABLE, expansion, expansion_adjoint, locate
 
 # Added to the variance of a layer's input: a deterministic one is a Gaussian of this variance.
 FLOOR = 1e-12

@@ -16,12 +16,7 @@ from functools import lru_cache
 import numpy as np
 from numba import njit
 
-OPTIONS = {
-    "cache": True,
-    "nogil": True,
-    "error_model": "numpy",
-    "fastmath": {"reassoc", "contract", "nsz", "arcp"},
-}
+from pyro_dynogp._compiled_cache import OPTIONS
 
 # Forms of a static function.
 TABLE = 0

@@ -21,8 +21,8 @@ import math
 import numpy as np
 from numba import njit
 
+from pyro_dynogp._compiled_cache import OPTIONS
 from pyro_dynogp.moments.blocks import Moments, Values, append, append_adjoint, workspace
-from pyro_dynogp.moments.functions import OPTIONS
 
 SEGMENT = 64
 _LOG_2PI = math.log(2.0 * math.pi)

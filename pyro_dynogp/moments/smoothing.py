@@ -13,8 +13,8 @@ import math
 import numpy as np
 from numba import njit
 
+from pyro_dynogp._compiled_cache import OPTIONS
 from pyro_dynogp.moments.blocks import append
-from pyro_dynogp.moments.functions import OPTIONS
 from pyro_dynogp.moments.recursion import (
     SEGMENT,
     covary,

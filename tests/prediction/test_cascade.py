@@ -347,7 +347,7 @@ class TestStaticFunction:
         wide = fit_of(known.model, draws, known.scaling).static_function("f", record)
         at = known.system.layer("f").function.moments(torch.tensor(wide.x)[:, None])
         np.testing.assert_allclose(wide.mean, at[0][0], atol=1e-9)
-        np.testing.assert_allclose(wide.sd, np.sqrt(at[1][0] + 0.25), rtol=1e-9)
+        np.testing.assert_allclose(wide.sd, np.sqrt(at[1][0].numpy() + 0.25), rtol=1e-9)
 
     def test_wrong_uses(self, known, twins):
         record, _ = wiener_data(known, n=20)
