@@ -55,6 +55,7 @@ def parallel_map(
     workers: int | None = None,
     progress: bool = False,
     description: str = "",
+    news: Callable[[Sequence[Result]], str] | None = None,
 ) -> list[Result]:
     """Apply a function to every item; results in the order of the items.
 
@@ -62,7 +63,8 @@ def parallel_map(
         function: importable or closure (it is sent to other processes).
         items: arguments, one for each call.
         workers: number of processes; 1 runs here, None uses every processor or the whole cluster.
-        progress: whether to show a bar. description: its label.
+        progress: whether to show a bar, with the time left. description: its label.
+        news: what to write beside the bar, of the results so far.
 
     Raises:
         ValueError: where workers is not a positive whole number. Errors of the function are
@@ -72,19 +74,24 @@ def parallel_map(
         raise invalid("workers", expected="a whole number >= 1, or None", got=repr(workers))
     bar = tqdm(total=len(items), desc=description, disable=not progress)
     results: list[Result] = []
+
+    def advance(result: Result) -> None:
+        results.append(result)
+        if news is not None:
+            bar.set_postfix_str(news(results), refresh=False)
+        bar.update()
+
     with bar:
         if workers == 1 or len(items) == 1:
             for item in items:
-                results.append(function(item))
-                bar.update()
+                advance(function(item))
             return results
         backend, _ = get_active_backend()
         local = type(backend).__name__ == "LokyBackend"
         count = min(len(items), workers or joblib.cpu_count()) if local else workers
         pool = joblib.Parallel(n_jobs=count, return_as="generator" if local else "list")
         for result in pool(joblib.delayed(_call)(function, item) for item in items):
-            results.append(result)
-            bar.update()
+            advance(result)
     return results
 
 

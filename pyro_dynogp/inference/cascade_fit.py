@@ -13,7 +13,7 @@ from pyro_dynogp.inference.cascade_starts import (
     starting_point,
 )
 from pyro_dynogp.inference.checkpoints import Checkpoints
-from pyro_dynogp.inference.maximum import Optimizer, Optimum, maximise, polish
+from pyro_dynogp.inference.maximum import Optimizer, Optimum, maximise
 from pyro_dynogp.inference.starts import starting_values
 from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.layers import Dynamic
@@ -85,7 +85,7 @@ def best_optima(
     """Optima of the collapsed model from all starts, best first."""
     starts = starting_points(model, records, restarts, steps, seed, workers, progress, checkpoints)
     argument = records[0] if len(records) == 1 else tuple(records)
-    optima = maximise(
+    return maximise(
         model,
         argument,
         starts,
@@ -96,14 +96,5 @@ def best_optima(
         progress=progress,
         checkpoints=checkpoints,
         key="cascade",
-    )
-    return polish(
-        model,
-        argument,
-        optima,
-        steps=max(1, steps // 2),
-        seed=seed,
-        workers=workers,
-        progress=progress,
-        checkpoints=checkpoints,
+        kept=0.5,
     )

@@ -75,7 +75,10 @@ class Plan:
 def plans(
     model: Cascade, optima: Mapping[str, Sequence[Mapping[str, Tensor]]], count: int, seed: int
 ) -> list[Plan]:
-    """Restarts in turn over leading layers, straight and curved, and optima of the linear fit.
+    """Restarts in turn over leading layers and optima of the linear fit.
+
+    A last static layer starts curved, but straight at every fourth restart: a straight start lets
+    the dynamics first imitate what the function should do, and seldom recovers.
 
     Args:
         optima: for each leading layer the linear optima, best first.
@@ -84,13 +87,19 @@ def plans(
     seeds = child_seeds(seed, count)
     if not names:
         return [Plan(None, None, bool(index % 2), s) for index, s in enumerate(seeds)]
-    shapes = [False, True] if isinstance(model.layers[-1], Static) else [False]
+    bends = isinstance(model.layers[-1], Static)
     out = []
+    used = dict.fromkeys(names, 0)  # linear optima, best first
     for index, s in enumerate(seeds):
-        name = names[index % len(names)]
-        turn, shape = divmod(index // len(names), len(shapes))
+        name, turn = names[index % len(names)], index // len(names)
+        curved = bends and turn % 4 != 1
         found = optima[name]
-        out.append(Plan(name, found[turn % len(found)], shapes[shape], s))
+        if bends and not curved:
+            linear = found[(turn // 4) % len(found)]
+        else:
+            linear = found[used[name] % len(found)]
+            used[name] += 1
+        out.append(Plan(name, linear, curved, s))
     return out
 
 

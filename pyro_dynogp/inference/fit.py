@@ -42,7 +42,7 @@ def fit(
     seed: int = 0,
     restarts: int | None = None,
     steps: int | None = None,
-    optimizer: Optimizer = "lbfgs",
+    optimizer: Optimizer | None = None,
     draws: int | None = None,
     chains: int = 4,
     warmup: int = 500,
@@ -58,8 +58,7 @@ def fit(
     is climbed from several starts, in parallel. "map" keeps the best optimum; "svi" fits a
     multivariate normal to the posterior around it (of a cascade, unless `hyperparameters` says
     otherwise, to that of inducing values and first states, with everything else at the optimum);
-    "nuts" samples it. The starts of a cascade are the best linear fits, spread over its layers;
-    its leading optima are compared by their evidence (Laplace), not by their height.
+    "nuts" samples it. The starts of a cascade are the best linear fits, spread over its layers.
 
     With another `guide` a cascade keeps its trajectories as sample sites, and Pyro's SVI fits them
     and the parameters together, from every start; the best is kept by its ELBO.
@@ -79,9 +78,10 @@ def fit(
         seed: the same seed gives the same numbers to the last bit on one machine.
         restarts: number of starting points (default 6; 8 for a cascade, 2 with trajectories as
             sites).
-        steps: most iterations of a start (default 500; Adam 1500; cascade 300) and, with "svi", of
-            SVI (default 1000; cascade 200, with trajectories as sites 1000).
-        optimizer: "lbfgs" or "adam", for the starts.
+        steps: most iterations of a start (default 500; Adam 1500; cascade 600) and, with "svi", of
+            SVI (default 1000; cascade 60, with trajectories as sites 1000).
+        optimizer: "lbfgs" or "adam", for the starts; "adam" by default for a cascade, whose density
+            has long ridges on which line searches stop, or lead to where noise is fitted.
         draws: posterior draws to keep ("svi", default 200) or to sample per chain ("nuts", 500).
         chains, warmup: of NUTS.
         particles, learning_rate: of SVI.
@@ -99,6 +99,8 @@ def fit(
         method = "svi" if cascade else "map"
     if method not in ("map", "svi", "nuts"):
         raise invalid("method", expected="'map', 'svi' or 'nuts'", got=repr(method))
+    if optimizer is None:
+        optimizer = "adam" if cascade else "lbfgs"
     if optimizer not in ("lbfgs", "adam"):
         raise invalid("optimizer", expected="'lbfgs' or 'adam'", got=repr(optimizer))
     asked = restarts is not None
@@ -149,7 +151,7 @@ def fit(
     if isinstance(model, Cascade):
         target: Any = model.collapsed
         optima = best_optima(
-            target, records, restarts, steps or 300, optimizer, seed, workers, progress, kept
+            target, records, restarts, steps or 600, optimizer, seed, workers, progress, kept
         )
     else:
         target = model
@@ -176,9 +178,7 @@ def fit(
         return Fit(
             draws=MappingProxyType({k: v.unsqueeze(0) for k, v in best.values.items()}),
             history=best.history,
-            diagnostics=MappingProxyType(
-                {"iterations": float(len(best.history)), "log_evidence": best.log_evidence}
-            ),
+            diagnostics=MappingProxyType({"iterations": float(len(best.history))}),
             **common,
         )
     if method == "svi":
@@ -188,7 +188,7 @@ def fit(
             argument,
             best.values,
             chosen,
-            steps=steps or (200 if cascade else 1000),
+            steps=steps or (60 if cascade else 1000),
             particles=particles,
             learning_rate=learning_rate,
             seed=seed,
@@ -207,7 +207,6 @@ def fit(
                 {
                     "elbo": float(tail.mean()),
                     "elbo_sd": float(tail.std()),
-                    "log_evidence": best.log_evidence,
                 }
             ),
             gaussian=posterior.guide,

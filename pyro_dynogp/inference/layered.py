@@ -139,12 +139,18 @@ def _run(task: _Task) -> Piece:
                 label=task.key,
                 key=task.key,
                 rise=0.5,
+                layers={one.name: one.described for one in task.model.wires},
             )
             with seeded(task.seed):
                 draws = _draw(guide, args, task.draws, vectorised=not own)
         return _pack(trained, draws)
 
     return task.checkpoints.piece(f"{task.key}-result", compute)
+
+
+def _level(piece: Piece) -> float:
+    """ELBO over the last steps."""
+    return float(piece["elbo"][-50:].mean())
 
 
 def _several(records: Record | tuple[Record, ...]) -> tuple[Record, ...]:
@@ -263,8 +269,15 @@ def fit_layered(
             zip(points, child_seeds(seed, restarts), strict=True)
         )
     ]
-    results = parallel_map(_run, tasks, workers=workers, progress=progress, description="SVI")
-    levels = [float(piece["elbo"][-50:].mean()) for piece in results]
+    results = parallel_map(
+        _run,
+        tasks,
+        workers=workers,
+        progress=progress,
+        description="SVI",
+        news=lambda found: f"elbo {max(_level(piece) for piece in found):.2f}",
+    )
+    levels = [_level(piece) for piece in results]
     order = np.argsort([-level for level in levels])
     best = results[int(order[0])]
     sampled = {k[len("draw/") :]: v for k, v in best.items() if k.startswith("draw/")}

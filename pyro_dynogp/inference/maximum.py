@@ -23,8 +23,6 @@ from pyro_dynogp.parallel import parallel_map, seeded
 from pyro_dynogp.record import Record
 
 Optimizer = Literal["lbfgs", "adam"]
-# Beside these, "preconditioned" is for ridges that neither follows.
-Method = Literal["lbfgs", "adam", "preconditioned"]
 
 
 @dataclass(frozen=True)
@@ -36,14 +34,12 @@ class Optimum:
         values: value of every latent site.
         history: energy after each iteration.
         message: why the optimiser stopped.
-        log_evidence: log p(y) by Laplace's approximation [nats], where it was computed.
     """
 
     energy: float
     values: dict[str, Tensor]
     history: np.ndarray
     message: str
-    log_evidence: float = -np.inf
 
 
 @dataclass(frozen=True)
@@ -51,7 +47,7 @@ class _Task:
     model: Any
     records: Record | Sequence[Record]
     values: dict[str, Tensor]
-    optimizer: Method
+    optimizer: Optimizer
     steps: int
     seed: int
     checkpoints: Checkpoints
@@ -73,7 +69,7 @@ def _lbfgs(potential: Potential, z: np.ndarray, steps: int) -> tuple[np.ndarray,
 
 def _adam(potential: Potential, z: np.ndarray, steps: int) -> tuple[np.ndarray, list, str]:
     x = torch.tensor(z, dtype=torch.float64, requires_grad=True)
-    optimizer = torch.optim.Adam([x], lr=0.03)
+    optimizer = torch.optim.Adam([x], lr=0.02)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps, eta_min=1e-4)
     history: list[float] = []
     best, best_z = np.inf, z
@@ -96,34 +92,7 @@ def _adam(potential: Potential, z: np.ndarray, steps: int) -> tuple[np.ndarray, 
     return best_z, history, "all steps used"
 
 
-def _preconditioned(
-    potential: Potential, z: np.ndarray, steps: int
-) -> tuple[np.ndarray, list, str]:
-    """L-BFGS in coordinates in which all curvatures at z are about one, negative ones too.
-
-    Time constants, gains and first states that make up for each other leave ridges whose curvatures
-    differ by a factor of 10^6; L-BFGS alone stops on them.
-    """
-    eigenvalues, vectors = np.linalg.eigh(potential.quick_hessian(z, jacobian=False))
-    root = vectors / np.sqrt(np.maximum(np.abs(eigenvalues), 1.0))
-
-    def function(x: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = potential.value_and_gradient(z + root @ x)
-        return value, root.T @ gradient
-
-    history: list[float] = []
-    result = minimize(
-        function,
-        np.zeros_like(z),
-        jac=True,
-        method="L-BFGS-B",
-        callback=lambda intermediate_result: history.append(float(intermediate_result.fun)),
-        options={"maxiter": steps, "maxfun": 2 * steps, "maxcor": 30, "ftol": 1e-8},
-    )
-    return z + root @ result.x, history, str(result.message)
-
-
-_METHODS = {"lbfgs": _lbfgs, "adam": _adam, "preconditioned": _preconditioned}
+_METHODS = {"lbfgs": _lbfgs, "adam": _adam}
 
 
 def _optimise(task: _Task) -> Optimum:
@@ -138,10 +107,7 @@ def _climb(task: _Task) -> Optimum:
         z, history, message = _METHODS[task.optimizer](potential, z, task.steps)
         energy = potential.value_and_gradient(z)[0]
         values = {k: v.detach() for k, v in potential.unpack(torch.tensor(z)).items()}
-        evidence = -np.inf
-        if task.optimizer == "preconditioned":
-            evidence = potential.log_evidence(z)
-    return Optimum(energy, values, np.asarray(history), message, evidence)
+    return Optimum(energy, values, np.asarray(history), message)
 
 
 def _pack(optimum: Optimum) -> Piece:
@@ -149,7 +115,6 @@ def _pack(optimum: Optimum) -> Piece:
         "energy": torch.tensor(optimum.energy, dtype=torch.float64),
         "history": torch.tensor(optimum.history, dtype=torch.float64),
         "message": text_tensor(optimum.message),
-        "evidence": torch.tensor(optimum.log_evidence, dtype=torch.float64),
         **{f"value/{name}": value for name, value in optimum.values.items()},
     }
 
@@ -158,45 +123,7 @@ def _unpack(piece: Piece) -> Optimum:
     values = {k[len("value/") :]: v for k, v in piece.items() if k.startswith("value/")}
     message = tensor_text(piece["message"])
     history = piece["history"].numpy()
-    return Optimum(float(piece["energy"]), values, history, message, float(piece["evidence"]))
-
-
-def polish(
-    model: Any,
-    records: Record | Sequence[Record],
-    optima: Sequence[Optimum],
-    *,
-    steps: int,
-    seed: int,
-    workers: int | None,
-    progress: bool,
-    checkpoints: Checkpoints = NOTHING_KEPT,
-) -> list[Optimum]:
-    """Climb on from the best optima by preconditioned L-BFGS, and rank them by their evidence.
-
-    The highest density is a poor judge between optima of very different width: a resonance at just
-    the frequency of an input, with a state that cancels it, can fit a little better and forecasts
-    badly. Its posterior mass is small, which the evidence knows.
-
-    Returns:
-        The polished optima by log evidence, the best first, then the rest by energy.
-    """
-    leading = list(optima[:POLISHED])
-    tasks = [
-        _Task(model, records, one.values, "preconditioned", steps, seed, checkpoints, f"polish-{i}")
-        for i, one in enumerate(leading)
-    ]
-    found = parallel_map(_optimise, tasks, workers=workers, progress=progress, description="polish")
-    joined = [
-        replace(after, history=np.concatenate([before.history, after.history]))
-        for before, after in zip(leading, found, strict=True)
-    ]
-    joined.sort(key=lambda optimum: -optimum.log_evidence)
-    return [*joined, *optima[POLISHED:]]
-
-
-# How many of the best optima are polished.
-POLISHED = 4
+    return Optimum(float(piece["energy"]), values, history, message)
 
 
 def maximise(
@@ -211,12 +138,13 @@ def maximise(
     progress: bool = False,
     checkpoints: Checkpoints = NOTHING_KEPT,
     key: str = "optimum",
+    kept: float = 1 / 3,
 ) -> list[Optimum]:
     """Climb from every start; the optima sorted by energy, best first.
 
-    All starts get a fifth of the steps, then the best third of them the rest (successive halving:
-    a start that is far behind by then hardly ever wins). The mode is that of the density of the
-    constrained values (no Jacobian), as AutoDelta has it.
+    All starts get a fifth of the steps, then the best of them, the share `kept`, the rest
+    (successive halving: a start that is far behind by then hardly ever wins). The mode is that of
+    the density of the constrained values (no Jacobian), as AutoDelta has it.
     """
 
     def climb(values: Sequence[dict[str, Tensor]], count: int, label: str) -> list[Optimum]:
@@ -233,7 +161,14 @@ def maximise(
             )
             for i, value in enumerate(values)
         ]
-        return parallel_map(_optimise, tasks, workers=workers, progress=progress, description=label)
+        return parallel_map(
+            _optimise,
+            tasks,
+            workers=workers,
+            progress=progress,
+            description=label,
+            news=lambda found: f"log p {-min(o.energy for o in found):.2f}",
+        )
 
     def best_first(optima: list[Optimum]) -> list[Optimum]:
         return sorted(optima, key=lambda optimum: optimum.energy)
@@ -244,7 +179,7 @@ def maximise(
     first = best_first(climb(starts, short, "starts"))
     if steps <= short:
         return first
-    cut = -(-len(first) // 3)
+    cut = max(1, round(kept * len(first)))
     leading = first[:cut]
     further = climb([optimum.values for optimum in leading], steps - short, "optima")
     joined = [

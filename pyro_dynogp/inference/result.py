@@ -48,7 +48,7 @@ class Fit:
         history: objective after each iteration: -log p(y, values) for "map" and "nuts" (of the
             best start), the ELBO for "svi" [nats].
         start_energies: -log p(y, values) that each start came to (-ELBO where trajectories are
-            sites), best first; of a cascade the leading ones are ranked by their evidence instead.
+            sites), best first.
         diagnostics: what the method says about itself, numbers by name.
         seed: the seed.
         training: fingerprints of the training records.

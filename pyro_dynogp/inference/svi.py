@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -29,13 +30,26 @@ class TrainingDivergedError(ValueError):
     Attributes:
         step: where. parameters: unconstrained values of the guide's parameters at the last good
             checkpoint. elbo: (step,) history up to it.
+        sites: names of the sample sites and parameters that were not finite, or whose density
+            could not be computed.
     """
 
     def __init__(
-        self, message: str, step: int, parameters: Mapping[str, Tensor], elbo: np.ndarray
+        self,
+        message: str,
+        step: int,
+        parameters: Mapping[str, Tensor],
+        elbo: np.ndarray,
+        sites: Sequence[str] = (),
     ) -> None:
         super().__init__(message)
         self.step, self.parameters, self.elbo = step, dict(parameters), elbo
+        self.sites = tuple(sites)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """With all attributes, so that it comes whole out of another process."""
+        arguments = (str(self), self.step, self.parameters, self.elbo, self.sites)
+        return (TrainingDivergedError, arguments)
 
 
 @dataclass(frozen=True)
@@ -68,11 +82,15 @@ def train(
     key: str = "svi",
     patience: int = 200,
     rise: float = 0.05,
+    layers: Mapping[str, str] = MappingProxyType({}),
 ) -> Trained:
     """Maximise an ELBO in the current parameter store, which should be a scope of its own.
 
     Stops early when the ELBO, averaged over 50 steps, has not risen by `rise` nats in `patience`
     steps. The learning rate falls to a tenth over all steps.
+
+    Args:
+        layers: what to call the layer of a site in an error, by the first part of the site's name.
 
     Raises:
         TrainingDivergedError: where the ELBO is not a number or cannot be computed; it names the
@@ -96,7 +114,9 @@ def train(
                 nonlocal live
                 if before is not None and not ready:
                     _restore(optimizer, settings, before, lambda: guide(*args))
-                values = [_step(svi, args, len(elbo) + i, before, elbo) for i in range(count)]
+                values = [
+                    _step(svi, args, len(elbo) + i, before, elbo, layers) for i in range(count)
+                ]
                 live = True
                 return {**_state(optimizer), "elbo": torch.tensor(values, dtype=torch.float64)}
 
@@ -116,34 +136,86 @@ def train(
     return Trained(np.asarray(elbo), parameters, message)
 
 
-def _step(svi: SVI, args: Any, step: int, state: Piece | None, elbo: list[float]) -> float:
+def _step(
+    svi: SVI,
+    args: Any,
+    step: int,
+    state: Piece | None,
+    elbo: list[float],
+    layers: Mapping[str, str],
+) -> float:
     before = {name: p.detach().clone() for name, p in _unconstrained().items()}
     try:
         value = -svi.step(*args)
-    except ValueError as error:  # NotPositiveDefiniteError is one
-        raise _diverged(str(error), step, state, elbo, before) from error
-    bad = [name for name, p in _unconstrained().items() if not bool(torch.isfinite(p).all())]
+    except (ValueError, torch.linalg.LinAlgError) as error:  # NotPositiveDefiniteError is one
+        raise _diverged(str(error), step, state, elbo, before, svi, args, layers) from error
+    bad = any(not bool(torch.isfinite(p).all()) for p in _unconstrained().values())
     if not np.isfinite(value) or bad:
-        reason = f"the ELBO became {value}"
-        if bad:
-            reason += f" and the parameters {', '.join(sorted(bad))} are not finite"
-        raise _diverged(reason, step, state, elbo, before)
+        reason = f"the ELBO became {value}" if not np.isfinite(value) else "a parameter overflowed"
+        raise _diverged(reason, step, state, elbo, before, svi, args, layers)
     return float(value)
 
 
 def _diverged(
-    reason: str, step: int, state: Piece | None, elbo: list[float], before: Mapping[str, Tensor]
+    reason: str,
+    step: int,
+    state: Piece | None,
+    elbo: list[float],
+    before: Mapping[str, Tensor],
+    svi: SVI,
+    args: Any,
+    layers: Mapping[str, str],
 ) -> TrainingDivergedError:
     good = before if all(bool(torch.isfinite(p).all()) for p in before.values()) else {}
     if not good and state is not None:
         good = {n[len("param/") :]: v for n, v in state.items() if n.startswith("param/")}
+    bad = [name for name, p in _unconstrained().items() if not bool(torch.isfinite(p).all())]
+    bad += [name for name in _broken_sites(svi, args) if name not in bad]
+    where = ""
+    if bad:
+        named = dict.fromkeys(
+            text for name in bad for key, text in layers.items() if _of(name, key)
+        )
+        where = f" Not finite: {', '.join(bad)}" + (f" ({', '.join(named)})" if named else "") + "."
     return TrainingDivergedError(
-        f"SVI diverged at step {step}: {reason}. Try a lower learning_rate, more particles, "
+        f"SVI diverged at step {step}: {reason.rstrip(".")}.{where} Try a lower learning_rate, more particles, "
         "another seed, or fewer pairs. The last good parameters are in the error's `parameters`.",
         step,
         good,
         np.asarray(elbo),
+        bad,
     )
+
+
+def _of(site: str, layer: str) -> bool:
+    """Whether a site or a guide's parameter belongs to a layer."""
+    return any(part == layer or part.startswith(f"{layer}_") for part in site.split("."))
+
+
+def _broken_sites(svi: SVI, args: Any) -> list[str]:
+    """Sites whose value or density is not finite, or cannot be computed, in one run."""
+    guide = pyro.poutine.trace(svi.guide)
+    with torch.no_grad(), pyro.validation_enabled(False):
+        try:
+            guide(*args)
+            model = pyro.poutine.trace(pyro.poutine.replay(svi.model, guide.trace))
+            model(*args)
+            nodes = model.trace.nodes
+        except (ValueError, RuntimeError):  # what it had come to tells enough
+            nodes = guide.trace.nodes
+    return [name for name, node in nodes.items() if _is_broken(node)]
+
+
+def _is_broken(node: Mapping[str, Any]) -> bool:
+    if node["type"] != "sample":
+        return False
+    try:
+        density = torch.as_tensor(node["fn"].log_prob(node["value"]))
+    except (ValueError, RuntimeError):
+        return True
+    value = torch.as_tensor(node["value"])
+    latent = not node["is_observed"]  # a missing output is NaN and no error
+    return bool(~torch.isfinite(density).all()) or bool(latent and ~torch.isfinite(value).all())
 
 
 def _unconstrained() -> dict[str, Tensor]:

@@ -83,6 +83,12 @@ class Wire:
     pathwise: bool
     last: bool
 
+    @property
+    def described(self) -> str:
+        """What to call the layer in a sentence."""
+        kind = "dynamic" if isinstance(self.layer, Dynamic) else "static"
+        return f"{kind} layer {self.name}"
+
 
 def wire(inputs: int, layers: Sequence[Layer]) -> tuple[Wire, ...]:
     """Name the layers, count their channels and say what each feeds.

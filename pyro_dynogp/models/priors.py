@@ -26,6 +26,7 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp._errors import invalid
+from pyro_dynogp.distributions.decay import LogDecayRate
 from pyro_dynogp.lti.modes import Modes, NoiseStructure
 from pyro_dynogp.scaling import Scaling
 
@@ -35,6 +36,9 @@ PriorName = Literal["default", "paper"]
 HORSESHOE_SCALE = 0.1
 # Least ratio of frequency to decay rate of a pair.
 CRITICAL = 0.02
+# Decay rates below this many per record are unlikely a priori: in 1/SETTLING of the record such a
+# mode has decayed to a third.
+SETTLING = 10.0
 # Standard deviation of a prior that is flat for all practical purposes.
 FLAT = 1e3
 
@@ -80,9 +84,9 @@ def sample_poles(name: str, pairs: int, time_scale: TimeScale, priors: PriorName
     """Sample P poles (*b, P) [1/s].
 
     Sites: ``<name>_log_decay`` and ``<name>_log_frequency`` (P,), logarithms of -Re lambda and of
-    Im lambda over the typical rate of the record. Default: uniform between the rates 1/duration
-    and pi/step (for frequencies from a tenth of the slowest rate, which is as good as a real pole).
-    Paper: flat.
+    Im lambda over the typical rate of the record. Default: `LogDecayRate` up to the rate pi/step,
+    which all but excludes what hardly decays within the record; frequencies uniform from a tenth of
+    the rate 1/duration (as good as a real pole) to pi/step. Paper: flat.
     """
     low, high = time_scale.rate_bounds
     if high <= low:
@@ -94,12 +98,10 @@ def sample_poles(name: str, pairs: int, time_scale: TimeScale, priors: PriorName
     else:
         half = 0.5 * (high - low)
         top = torch.full((pairs,), half, dtype=torch.float64)
-
-        def uniform(bottom: float) -> dist.Distribution:
-            return dist.Uniform(torch.full_like(top, bottom), top).to_event(1)
-
-        log_decay = pyro.sample(f"{name}_log_decay", uniform(-half))
-        log_frequency = pyro.sample(f"{name}_log_frequency", uniform(-half - math.log(10.0)))
+        settling = torch.full_like(top, SETTLING / math.exp(half))
+        log_decay = pyro.sample(f"{name}_log_decay", LogDecayRate(settling, top).to_event(1))
+        bottom = torch.full_like(top, -half - math.log(10.0))
+        log_frequency = pyro.sample(f"{name}_log_frequency", dist.Uniform(bottom, top).to_event(1))
     decay = time_scale.typical_rate * log_decay.exp()
     undamped = time_scale.typical_rate * log_frequency.exp()
     # The floor is as good as a double real pole (relative error 4e-4) and keeps residues bounded.

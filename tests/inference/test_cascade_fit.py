@@ -1,5 +1,6 @@
 """Fits of cascades: every architecture, guide and noise; what an ELBO must be; what is refused."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -333,3 +334,7 @@ def test_divergence_names_parameters_and_keeps_the_last_good_ones(bent):
     assert "g.pseudo_outputs" in error.parameters
     assert all(bool(torch.isfinite(p).all()) for p in error.parameters.values())
     assert "learning_rate" in str(error)
+    assert error.sites
+    assert "dynamic layer g" in str(error)
+    again = pickle.loads(pickle.dumps(error))  # it may come from another process
+    assert (str(again), again.sites) == (str(error), error.sites)

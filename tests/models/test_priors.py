@@ -11,6 +11,7 @@ import pyro_dynogp as dgp
 from pyro_dynogp.lti.views import frequency_response, steady_state_gain
 from pyro_dynogp.models.priors import (
     CRITICAL,
+    SETTLING,
     TimeScale,
     numerators,
     residues,
@@ -132,11 +133,12 @@ def test_poles_stay_within_what_the_record_can_show():
         modes = sample_modes("g", inputs=1, pairs=2, time_scale=scale)
     assert modes.batch_shape == (500,)
     decay = -modes.poles.real
-    assert float(decay.min()) >= 1 / 50
     assert float(decay.max()) <= math.pi / 0.1
-    # log-uniform: a quarter of the draws in each quarter of the logarithmic range
-    counts = torch.histc(decay.log(), 4, math.log(1 / 50), math.log(math.pi / 0.1))
-    assert float((counts / counts.sum() - 0.25).abs().max()) < 5 * math.sqrt(0.25 * 0.75 / 1000)
+    # The root of a time constant is half-normal, here of a twentieth of the record on average.
+    constant = 1.0 / decay
+    assert float(constant.mean()) == pytest.approx(50.0 / (2 * SETTLING), rel=0.2)
+    assert float((constant > 50.0 / 2).double().mean()) < 0.01
+    assert float(modes.poles.imag.max()) <= math.pi / 0.1 * math.hypot(1.0, CRITICAL)
 
 
 def test_unknown_priors_and_too_short_records_are_refused():
