@@ -148,7 +148,9 @@ def _step(
     try:
         value = -svi.step(*args)
     except (ValueError, torch.linalg.LinAlgError) as error:  # NotPositiveDefiniteError is one
-        raise _diverged(str(error), step, state, elbo, before, svi, args, layers) from error
+        raise _diverged(
+            str(error).rstrip("."), step, state, elbo, before, svi, args, layers
+        ) from error
     bad = any(not bool(torch.isfinite(p).all()) for p in _unconstrained().values())
     if not np.isfinite(value) or bad:
         reason = f"the ELBO became {value}" if not np.isfinite(value) else "a parameter overflowed"
@@ -178,7 +180,7 @@ def _diverged(
         )
         where = f" Not finite: {', '.join(bad)}" + (f" ({', '.join(named)})" if named else "") + "."
     return TrainingDivergedError(
-        f"SVI diverged at step {step}: {reason.rstrip(".")}.{where} Try a lower learning_rate, more particles, "
+        f"SVI diverged at step {step}: {reason.rstrip('.')}.{where} Try a lower learning_rate, more particles, "
         "another seed, or fewer pairs. The last good parameters are in the error's `parameters`.",
         step,
         good,

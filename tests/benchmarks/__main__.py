@@ -11,13 +11,22 @@ import joblib
 import numba
 import torch
 
-from tests.benchmarks import calibration, cascade_cost, example2, reference, speed, wiener
+from tests.benchmarks import (
+    calibration,
+    cascade_cost,
+    example2,
+    guides,
+    reference,
+    speed,
+    wiener,
+)
 
 PARTS = {
     "speed": speed.run,
     "example2": example2.run,
     "wiener": wiener.run,
     "cascade_cost": cascade_cost.run,
+    "guides": guides.run,
     "reference": reference.run,
     "calibration": calibration.run,
 }
