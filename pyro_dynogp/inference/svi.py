@@ -180,7 +180,7 @@ def _diverged(
         )
         where = f" Not finite: {', '.join(bad)}" + (f" ({', '.join(named)})" if named else "") + "."
     return TrainingDivergedError(
-        f"SVI diverged at step {step}: {reason.rstrip('.')}.{where} Try a lower learning_rate, more particles, "
+        f"SVI diverged at step {step}: {reason}.{where} Try a lower learning_rate, more particles, "
         "another seed, or fewer pairs. The last good parameters are in the error's `parameters`.",
         step,
         good,
