@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pyro
@@ -15,21 +15,19 @@ from torch import Tensor
 from pyro_dynogp._errors import invalid
 from pyro_dynogp.inference.cascade_fit import GuideChoice, best_optima
 from pyro_dynogp.inference.checkpoints import Checkpoints
-from pyro_dynogp.inference.guides import GaussianGuide
+from pyro_dynogp.inference.guides import Guide
 from pyro_dynogp.inference.layered import fit_layered
 from pyro_dynogp.inference.maximum import Optimizer, Optimum, maximise
+from pyro_dynogp.inference.posterior import Hyperparameters, posterior_of
 from pyro_dynogp.inference.result import Fit, Method
 from pyro_dynogp.inference.sampling import sample_posterior
 from pyro_dynogp.inference.starts import starting_values
-from pyro_dynogp.inference.variational import VariationalPosterior, variational
 from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.linear import LinearDynamicGP
 from pyro_dynogp.parallel import seeded
 from pyro_dynogp.record import Record, as_records
 
 __all__ = ["Fit", "fit"]
-
-Hyperparameters = Literal["map", "normal", "multivariate normal"]
 
 
 def fit(
@@ -57,7 +55,8 @@ def fit(
     The marginal posterior (exact for a linear model, by the moment-matching filter for a cascade)
     is climbed from several starts, in parallel. "map" keeps the best optimum; "svi" fits a
     multivariate normal to the posterior around it (of a cascade, unless `hyperparameters` says
-    otherwise, to that of inducing values and first states, with everything else at the optimum);
+    otherwise, to that of inducing values and first states around up to four optima, with everything
+    else at the optimum: see `pyro_dynogp.inference.posterior`);
     "nuts" samples it. The starts of a cascade are the best linear fits, spread over its layers.
 
     With another `guide` a cascade keeps its trajectories as sample sites, and Pyro's SVI fits them
@@ -183,34 +182,34 @@ def fit(
         )
     if method == "svi":
         chosen = hyperparameters or ("map" if cascade else "multivariate normal")
-        posterior, fixed = _variational(
+        found = posterior_of(
             target,
             argument,
-            best.values,
+            optima,
             chosen,
             steps=steps or (60 if cascade else 1000),
             particles=particles,
             learning_rate=learning_rate,
             seed=seed,
+            workers=workers,
             checkpoints=kept,
             progress=progress,
         )
-        count = draws or 200
         with seeded(seed):
-            sampled = _draws_of(posterior.guide, argument, count)
-        sampled |= {k: v.expand(count, *v.shape).clone() for k, v in fixed.items()}
-        tail = posterior.elbo[-50:]
+            sampled = _draws_of(found.guide, argument, draws or 200, best.values)
+        tail = found.elbo[-50:]
+        common["mode"] = MappingProxyType(dict(found.mode))
         return Fit(
             draws=MappingProxyType(sampled),
-            history=posterior.elbo,
+            history=found.elbo,
             diagnostics=MappingProxyType(
                 {
                     "elbo": float(tail.mean()),
                     "elbo_sd": float(tail.std()),
+                    "optima": float(found.optima),
                 }
             ),
-            gaussian=posterior.guide,
-            fixed=MappingProxyType(dict(fixed)),
+            posterior=found.guide,
             **common,
         )
     chain = sample_posterior(
@@ -254,7 +253,7 @@ def _identity(guide: GuideChoice) -> object:
 
 def _common(
     model: Any, method: Method, optima: Sequence[Optimum], seed: int, records: Sequence[Record]
-) -> Mapping[str, Any]:
+) -> dict[str, Any]:
     return {
         "model": model,
         "method": method,
@@ -265,31 +264,7 @@ def _common(
     }
 
 
-def _variational(
-    target: Any,
-    argument: Any,
-    values: Mapping[str, Tensor],
-    hyperparameters: Hyperparameters,
-    **options: Any,
-) -> tuple[VariationalPosterior, Mapping[str, Tensor]]:
-    """Normal posterior of the free sites, and the values of those that stay at the optimum."""
-    if hyperparameters != "map":
-        independent = hyperparameters == "normal"
-        found = variational(target, (argument,), dict(values), independent=independent, **options)
-        return found, {}
-    free = {k: v for k, v in values.items() if k.endswith("_values") or "_initial_state" in k}
-    fixed = {k: v for k, v in values.items() if k not in free}
-    if not free:
-        raise invalid(
-            "hyperparameters",
-            expected="'normal' or 'multivariate normal' for a cascade without static layers",
-            got="'map'",
-        )
-    conditioned = pyro.poutine.condition(target, data=fixed)
-    return variational(conditioned, (argument,), free, **options), fixed
-
-
-def _draws_of(guide: GaussianGuide, args: Any, count: int) -> dict[str, Tensor]:
+def _draws_of(guide: Guide, args: Any, count: int, sites: Iterable[str]) -> dict[str, Tensor]:
     with torch.no_grad(), pyro.plate("draws", count, dim=-1):
         trace = pyro.poutine.trace(guide).get_trace(args)
-    return {site.name: trace.nodes[site.name]["value"] for site in guide.sites}
+    return {name: trace.nodes[name]["value"] for name in sites}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,15 +19,16 @@ class PointGuide:
     """Delta at the posterior mode: what AutoDelta would hold.
 
     Attributes:
-        values: value of every latent site.
+        values: (*b, *shape) of every latent site. batch: the number of dimensions *b.
     """
 
     values: Mapping[str, Tensor]
+    batch: int = 0
 
     def __call__(self, *args: Any) -> dict[str, Tensor]:
         """Sample (repeat) every site."""
         return {
-            name: pyro.sample(name, dist.Delta(value, event_dim=value.dim()))
+            name: pyro.sample(name, dist.Delta(value, event_dim=value.dim() - self.batch))
             for name, value in self.values.items()
         }
 
@@ -90,19 +91,43 @@ class GaussianGuide:
 
 
 @dataclass(frozen=True)
-class JointGuide:
-    """Some sites at a point, the others normal.
+class MixtureGuide:
+    """Several optima, each with its own weight: some sites at a point there, the others normal.
 
     Attributes:
-        point: of the former. gaussian: of the latter.
+        weights: (K,) of the optima, the best first. points: (K, *shape) of the former sites.
+        loc: (K, d), scale_tril: (K, d, d) of the unconstrained vector of the latter.
+        sites: as of `GaussianGuide`.
     """
 
-    point: PointGuide
-    gaussian: GaussianGuide
+    weights: Tensor
+    points: Mapping[str, Tensor]
+    loc: Tensor
+    scale_tril: Tensor
+    sites: Any
+
+    @classmethod
+    def of(
+        cls,
+        weights: Tensor,
+        points: Sequence[Mapping[str, Tensor]],
+        normals: Sequence[GaussianGuide],
+    ) -> MixtureGuide:
+        """From the posterior at each optimum."""
+        return cls(
+            weights,
+            {name: torch.stack([p[name] for p in points]) for name in points[0]},
+            torch.stack([one.loc for one in normals]),
+            torch.stack([one.scale_tril for one in normals]),
+            normals[0].sites,
+        )
 
     def __call__(self, *args: Any) -> dict[str, Tensor]:
-        """Sample every site."""
-        return {**self.point(*args), **self.gaussian(*args)}
+        """Sample an optimum (auxiliary site ``_optimum``), then every site there."""
+        k = pyro.sample("_optimum", dist.Categorical(self.weights), infer={"is_auxiliary": True})
+        point = PointGuide({name: x[k] for name, x in self.points.items()}, k.dim())
+        normal = GaussianGuide(self.loc[k], self.scale_tril[k], self.sites)
+        return {**point(*args), **normal(*args)}
 
 
 def gaussian_guide(potential: Potential, loc: Tensor, scale_tril: Tensor) -> GaussianGuide:

@@ -18,7 +18,7 @@ from pyro_dynogp.inference.guides import (
     DrawsGuide,
     GaussianGuide,
     Guide,
-    JointGuide,
+    MixtureGuide,
     PointGuide,
 )
 from pyro_dynogp.lti.modes import Modes
@@ -52,8 +52,7 @@ class Fit:
         diagnostics: what the method says about itself, numbers by name.
         seed: the seed.
         training: fingerprints of the training records.
-        gaussian: the variational posterior ("svi" without trajectories as sites).
-        fixed: sites that `gaussian` does not have, at the optimum.
+        posterior: the variational posterior ("svi" without trajectories as sites).
         trajectories: (S, ...) draws of trajectories and other sites that belong to the training
             record, where the guide had them.
     """
@@ -67,8 +66,7 @@ class Fit:
     diagnostics: Mapping[str, float]
     seed: int
     training: tuple[str, ...]
-    gaussian: GaussianGuide | None = field(default=None)
-    fixed: Mapping[str, Tensor] = field(default_factory=dict)
+    posterior: GaussianGuide | MixtureGuide | None = field(default=None)
     trajectories: Mapping[str, Tensor] = field(default_factory=dict)
 
     @property
@@ -83,11 +81,7 @@ class Fit:
         """The posterior as a Pyro guide, to be called with a record."""
         if self.method == "map":
             return PointGuide(dict(self.mode))
-        if self.gaussian is None:
-            return DrawsGuide(dict(self.draws))
-        return (
-            JointGuide(PointGuide(dict(self.fixed)), self.gaussian) if self.fixed else self.gaussian
-        )
+        return DrawsGuide(dict(self.draws)) if self.posterior is None else self.posterior
 
     @cached_property
     def system(self) -> Any:

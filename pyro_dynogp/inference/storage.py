@@ -17,7 +17,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from pyro_dynogp._errors import invalid
-from pyro_dynogp.inference.guides import GaussianGuide
+from pyro_dynogp.inference.guides import GaussianGuide, MixtureGuide
 from pyro_dynogp.inference.potential import Potential
 from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.models.cascade import Cascade
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from pyro_dynogp.inference.result import Fit
 
 FORMAT = "pyro_dynogp.fit"
-VERSION = 1
+VERSION = 2
 # The models that a file may name: a file never decides what code is run.
 MODELS = {"Cascade": Cascade, "LinearDynamicGP": LinearDynamicGP}
 LAYERS: dict[str, type[Dynamic] | type[Static]] = {"Dynamic": Dynamic, "Static": Static}
@@ -44,12 +44,16 @@ def save(fit: Fit, path: str | Path) -> None:
     options = _options(fit.model)
     tensors = {f"draws/{name}": value.contiguous() for name, value in fit.draws.items()}
     tensors |= {f"mode/{name}": value.contiguous() for name, value in fit.mode.items()}
-    tensors |= {f"fixed/{name}": value.contiguous() for name, value in fit.fixed.items()}
     tensors["history"] = torch.as_tensor(np.ascontiguousarray(fit.history))
     tensors["start_energies"] = torch.as_tensor(np.ascontiguousarray(fit.start_energies))
-    if fit.gaussian is not None:
-        tensors["gaussian/loc"] = fit.gaussian.loc.contiguous()
-        tensors["gaussian/scale_tril"] = fit.gaussian.scale_tril.contiguous()
+    points: Mapping[str, Tensor] = {}
+    if fit.posterior is not None:
+        tensors["posterior/loc"] = fit.posterior.loc
+        tensors["posterior/scale_tril"] = fit.posterior.scale_tril
+    if isinstance(fit.posterior, MixtureGuide):
+        points = fit.posterior.points
+        tensors["posterior/weights"] = fit.posterior.weights
+        tensors |= {f"point/{name}": value for name, value in points.items()}
     header = {
         "format": FORMAT,
         "version": VERSION,
@@ -61,7 +65,7 @@ def save(fit: Fit, path: str | Path) -> None:
         "training": list(fit.training),
         "diagnostics": dict(fit.diagnostics),
         "sites": list(fit.draws),
-        "fixed": list(fit.fixed),
+        "points": list(points),
     }
     folder = Path(path).resolve().parent
     if not folder.is_dir():
@@ -164,15 +168,14 @@ def _restore(kind: type[Fit], header: dict[str, Any], tensors: dict[str, Any]) -
     model = _model(name, header["options"], scaling)
     draws = {site: tensors[f"draws/{site}"] for site in header["sites"]}
     mode = {site: tensors[f"mode/{site}"] for site in header["sites"]}
-    # Files of before there were cascades do not say.
-    fixed = {site: tensors[f"fixed/{site}"] for site in header.get("fixed", ())}
-    gaussian = None
-    if "gaussian/loc" in tensors:
-        gaussian = GaussianGuide(
-            tensors["gaussian/loc"],
-            tensors["gaussian/scale_tril"],
-            _sites(model, scaling, mode, fixed, len(header["training"])),
-        )
+    points = {site: tensors[f"point/{site}"] for site in header["points"]}
+    posterior: GaussianGuide | MixtureGuide | None = None
+    if "posterior/loc" in tensors:
+        sites = _sites(model, scaling, mode, points, len(header["training"]))
+        normal = tensors["posterior/loc"], tensors["posterior/scale_tril"], sites
+        posterior = GaussianGuide(*normal)
+        if "posterior/weights" in tensors:
+            posterior = MixtureGuide(tensors["posterior/weights"], points, *normal)
     return kind(
         model=model,
         method=header["method"],
@@ -183,8 +186,7 @@ def _restore(kind: type[Fit], header: dict[str, Any], tensors: dict[str, Any]) -
         diagnostics=MappingProxyType(header["diagnostics"]),
         seed=header["seed"],
         training=tuple(header["training"]),
-        gaussian=gaussian,
-        fixed=MappingProxyType(fixed),
+        posterior=posterior,
     )
 
 
@@ -192,7 +194,7 @@ def _sites(
     model: LinearDynamicGP | Cascade,
     scaling: Scaling,
     mode: Mapping[str, Tensor],
-    fixed: Mapping[str, Tensor],
+    points: Mapping[str, Tensor],
     records: int,
 ) -> tuple[Any, ...]:
     """The sites of the normal posterior in their order, without the training records."""
@@ -203,6 +205,7 @@ def _sites(
         for index in range(records):
             model.sample_states("" if records == 1 else f"_{index}")
 
-    free = {name: value for name, value in mode.items() if name not in fixed}
-    conditioned = pyro.poutine.condition(parameters, data=dict(fixed))
+    free = {name: value for name, value in mode.items() if name not in points}
+    at = {name: mode[name] for name in points}
+    conditioned = pyro.poutine.condition(parameters, data=at)
     return tuple(Potential(conditioned, (), free).sites)

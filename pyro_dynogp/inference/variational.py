@@ -65,6 +65,7 @@ def variational(
     seed: int = 0,
     independent: bool = False,
     checkpoints: Checkpoints = NOTHING_KEPT,
+    key: str = "posterior",
     progress: bool = False,
 ) -> VariationalPosterior:
     """Fit a multivariate normal to the posterior by Pyro's SVI, from values near its mode.
@@ -75,13 +76,15 @@ def variational(
     """
     potential = Potential(model, args, values)
     if independent:
-        return _independent(potential, steps, particles, learning_rate, seed, checkpoints, progress)
+        return _independent(
+            potential, steps, particles, learning_rate, seed, checkpoints, key, progress
+        )
 
     def laplace() -> dict[str, Tensor]:
         centre, root = potential.laplace(values, widest=2.0)
         return {"centre": torch.as_tensor(centre), "root": torch.as_tensor(root)}
 
-    found = checkpoints.piece("laplace", laplace)
+    found = checkpoints.piece(f"{key}-laplace", laplace)
     centre, root = found["centre"], found["root"]
     start = {name: value.detach() for name, value in potential.unpack(centre).items()}
     guide = PreconditionedNormal(model, centre, root, init_loc_fn=init_to_value(values=start))
@@ -98,6 +101,7 @@ def variational(
             seed=seed,
             checkpoints=checkpoints,
             progress=progress,
+            key=f"{key}-svi",
         )
         names = list(guide._unconstrained_shapes)
         if names != order:
@@ -114,6 +118,7 @@ def _independent(
     learning_rate: float,
     seed: int,
     checkpoints: Checkpoints,
+    key: str,
     progress: bool,
 ) -> VariationalPosterior:
     """A normal with diagonal covariance, narrow at first: ridges are thin."""
@@ -133,6 +138,7 @@ def _independent(
             seed=seed,
             checkpoints=checkpoints,
             progress=progress,
+            key=f"{key}-svi",
         )
         posterior = guide.get_posterior().base_dist
         fitted = gaussian_guide(potential, posterior.loc, torch.diag(posterior.scale))

@@ -13,6 +13,7 @@ from pyro.infer.autoguide import AutoNormal
 import pyro_dynogp as dgp
 from pyro_dynogp.guides.families import Point
 from pyro_dynogp.inference.cascade_starts import Plan, linear_twin, starting_point
+from pyro_dynogp.inference.guides import GaussianGuide, MixtureGuide
 from pyro_dynogp.inference.layered import layer_guide
 from pyro_dynogp.inference.starts import starting_values
 from tests.inference.cascades import FAST, same, wiener, wiener_record
@@ -61,10 +62,11 @@ def test_hyperparameters(hyperparameters, bent):
     still = {name for name, sd in spread.items() if sd == 0.0}
     if hyperparameters == "map":
         assert set(fit.draws) - still == {"f_values", "g_initial_state"}
-        assert set(fit.fixed) == still
+        assert isinstance(fit.posterior, MixtureGuide)
+        assert set(fit.posterior.points) == still
     else:
         assert not still
-        assert not fit.fixed
+        assert isinstance(fit.posterior, GaussianGuide)
     assert set(fit.guide(bent)) == set(fit.draws)
 
 
@@ -73,8 +75,7 @@ def test_one_dynamic_layer_is_the_linear_model(record):
     train = record[:60]
     model = dgp.Cascade(1, (dgp.Dynamic(pairs=1),), priors="paper")
     cascade = dgp.fit(model, train, hyperparameters="multivariate normal", **FAST)
-    assert not cascade.fixed
-    assert cascade.gaussian is not None
+    assert isinstance(cascade.posterior, GaussianGuide)
     assert all(bool((v[0] != v[-1]).any()) for v in cascade.draws.values())
     # Flat priors: by default gains of a layer, which has unit scale, have a narrower one.
     linear = dgp.LinearDynamicGP(inputs=1, pairs=1, priors="paper").scaled_to(train)

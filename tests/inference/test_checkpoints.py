@@ -136,7 +136,7 @@ def stamps(folder):
     ("options", "name", "chunk", "piece", "rest"),
     [
         # Small pieces, since the starts and their optima take as many steps.
-        ("COLLAPSED", "collapsed_fit", 4, "svi-{:07d}", range(8, 25, 4)),
+        ("COLLAPSED", "collapsed_fit", 4, "posterior-0-svi-{:07d}", range(8, 25, 4)),
         ("LAYERED", "layered_fit", 50, "start-0-{:07d}", (75,)),
     ],
 )

@@ -1,0 +1,95 @@
+"""A posterior around several optima: weights, draws, density."""
+
+import math
+
+import numpy as np
+import pyro
+import pytest
+import torch
+
+import pyro_dynogp as dgp
+from pyro_dynogp.inference.guides import GaussianGuide, MixtureGuide
+from pyro_dynogp.inference.posterior import MOST_OPTIMA, spread
+from tests.inference.cascades import FAST, wiener
+
+
+@pytest.fixture(scope="module")
+def several(bent):
+    options = {**FAST, "restarts": 6, "steps": 20, "draws": 400}
+    return dgp.fit(wiener(), bent, **options)
+
+
+def test_consists_of_distinct_optima_by_weight(several):
+    posterior = several.posterior
+    assert isinstance(posterior, MixtureGuide)
+    K = len(posterior.weights)
+    assert 2 <= K <= MOST_OPTIMA
+    assert several.diagnostics["optima"] == K
+    assert float(posterior.weights.sum()) == pytest.approx(1.0)
+    assert (posterior.weights.diff() <= 0).all()  # the best first
+    decays = posterior.points["g_log_decay"]
+    assert len({tuple(row.tolist()) for row in decays}) == K
+    assert torch.equal(several.mode["g_log_decay"], decays[0])
+    assert several.diagnostics["elbo"] == pytest.approx(several.elbo[-50:].mean())
+
+
+def test_draws_come_from_each_optimum_in_its_share(several):
+    posterior = several.posterior
+    drawn = several.draws["g_log_decay"]
+    for point, weight in zip(posterior.points["g_log_decay"], posterior.weights, strict=True):
+        share = float((drawn == point).all(-1).double().mean())
+        w = float(weight)
+        assert share == pytest.approx(w, abs=4 * math.sqrt(w * (1 - w) / len(drawn)) + 1e-9)
+
+
+def test_sites_of_one_draw_belong_to_one_optimum(several):
+    """Points and inducing values are drawn together: each draw's values suit its function."""
+    posterior = several.posterior
+    with torch.no_grad(), pyro.plate("draws", 2000, dim=-1):
+        trace = pyro.poutine.trace(posterior).get_trace()
+    chosen = trace.nodes["_optimum"]["value"]
+    values = trace.nodes["f_values"]["value"].reshape(2000, -1)
+    for k in range(len(posterior.weights)):
+        here = values[chosen == k]
+        if len(here) < 50:
+            continue
+        M = here.shape[-1]
+        mean, root = posterior.loc[k], posterior.scale_tril[k]
+        first = 0 if posterior.sites[0].name == "f_values" else posterior.sites[0].shape.numel()
+        sd = (root @ root.mT).diagonal().sqrt()[first : first + M]
+        z = (here.mean(0) - mean[first : first + M]) / (sd / math.sqrt(len(here)))
+        assert float(z.abs().max()) < 5.0
+        chosen_points = trace.nodes["g_log_decay"]["value"][chosen == k]
+        assert torch.equal(chosen_points[0], posterior.points["g_log_decay"][k])
+
+
+def test_density_of_a_draw_is_the_component_s(several):
+    posterior = several.posterior
+    with torch.random.fork_rng():
+        torch.manual_seed(1)
+        trace = pyro.poutine.trace(posterior).get_trace()
+    k = trace.nodes["_optimum"]["value"]
+    normal = GaussianGuide(posterior.loc[k], posterior.scale_tril[k], posterior.sites)
+    with torch.random.fork_rng():
+        torch.manual_seed(1)
+        z = trace.nodes["_latent"]["value"]
+    expected = (
+        torch.distributions.MultivariateNormal(normal.loc, scale_tril=normal.scale_tril).log_prob(z)
+        + posterior.weights[k].log()
+    )
+    assert float(trace.log_prob_sum()) == pytest.approx(float(expected))
+
+
+def test_spread_is_that_of_log_densities_of_a_normal():
+    values = {"a": torch.zeros(3, 4), "b": torch.zeros(6)}
+    x = np.random.default_rng(0).standard_normal((20000, 18))
+    assert spread(values) == pytest.approx((-0.5 * (x**2).sum(1)).std(), rel=0.03)
+
+
+def test_saved_and_loaded_with_all_optima(several, tmp_path, bent):
+    several.save(tmp_path / "fit")
+    again = dgp.load(tmp_path / "fit")
+    assert torch.equal(again.posterior.weights, several.posterior.weights)
+    assert torch.equal(again.posterior.scale_tril, several.posterior.scale_tril)
+    assert again.posterior.points.keys() == several.posterior.points.keys()
+    assert np.array_equal(several.simulate(bent).mean, again.simulate(bent).mean)
