@@ -14,6 +14,7 @@ import torch
 from tests.benchmarks import (
     calibration,
     cascade_cost,
+    electricity,
     example2,
     guides,
     reference,
@@ -27,6 +28,7 @@ PARTS = {
     "wiener": wiener.run,
     "cascade_cost": cascade_cost.run,
     "guides": guides.run,
+    "electricity": electricity.run,
     "reference": reference.run,
     "calibration": calibration.run,
 }

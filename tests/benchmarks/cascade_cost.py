@@ -28,6 +28,8 @@ AUTHORS = {
     "electricity": 36.7 * 25,
 }
 PARTICLES = 10
+# Lengths of records at which the growth of the cost is measured.
+GROWTH = (1000, 10_000, 100_000, 1_000_000)
 
 
 def models() -> dict[str, tuple[Cascade, int]]:
@@ -128,7 +130,7 @@ def run(folder: Path) -> str:
             cells += [f"{time_:.3g}", f"{memory:.1f}", f"{AUTHORS[name] / time_:.0f}"]
             print(name, kind, time_, memory, flush=True)
         lines.append("| " + " | ".join(cells) + " |")
-    grown = {n: measure("collapsed", "Wiener", n) for n in (1000, 10_000, 100_000)}
+    grown = {n: measure("collapsed", "Wiener", n) for n in GROWTH}
     slope = np.log(grown[100_000][0] / grown[10_000][0]) / np.log(10.0)
     lines += ["", "Collapsed Wiener step: " + "; ".join(
         f"n = {n}: {t:.3g} s, {g:.1f} GB" for n, (t, g) in grown.items()

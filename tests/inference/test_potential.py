@@ -85,6 +85,17 @@ def test_out_of_range_is_a_wall_not_a_crash(potential):
     assert not gradient.any()
 
 
+def test_a_matrix_without_a_factor_is_a_wall_too():
+    def model():
+        x = pyro.sample("x", dist.Normal(torch.tensor(0.0).double(), 1.0))
+        root = torch.linalg.cholesky(x * torch.eye(2, dtype=torch.float64))
+        pyro.sample("y", dist.Normal(root.sum(), 1.0), obs=torch.tensor(0.0).double())
+
+    function = Potential(model, (), {"x": torch.tensor(1.0).double()})
+    assert function.value_and_gradient(np.array([0.5]))[0] < 1e3
+    assert function.value_and_gradient(np.array([-0.5])) == (1e15, np.zeros(1))
+
+
 def test_every_latent_site_needs_a_value():
     def model():
         pyro.sample("x", dist.Normal(0.0, 1.0))
