@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pyro_dynogp import datasets, plotting
     from pyro_dynogp.distributions.conditioned import ConditionedLTIProcess
+    from pyro_dynogp.distributions.decay import LogDecayRate
     from pyro_dynogp.distributions.inducing import InducingLTIProcess, inducing_times
     from pyro_dynogp.distributions.process import LTIProcess, ObservedLTIProcess
     from pyro_dynogp.distributions.reparam import InnovationReparam
@@ -69,6 +70,7 @@ _HOME = {
     "LTIMean": "pyro_dynogp.gp",
     "LTIParameters": "pyro_dynogp.gp",
     "LTIProcess": "pyro_dynogp.distributions.process",
+    "LogDecayRate": "pyro_dynogp.distributions.decay",
     "LayerGuide": "pyro_dynogp.guides.layer_guide",
     "Likelihood": "pyro_dynogp.layers.noise",
     "LinearDynamicGP": "pyro_dynogp.models.linear",
@@ -122,6 +124,7 @@ __all__ = [
     "LayerGuide",
     "Likelihood",
     "LinearDynamicGP",
+    "LogDecayRate",
     "MeanField",
     "ModalState",
     "Modes",

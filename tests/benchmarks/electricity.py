@@ -56,7 +56,7 @@ def run(folder: Path) -> str:
     step = cascade_cost.one("collapsed", "electricity", TRAINING)
     steps = max(20, int(60.0 * MINUTES / step))
     begin = time.perf_counter()
-    fit = dgp.fit(model, train, method="map", restarts=1, steps=steps, workers=2, progress=True)
+    fit = dgp.fit(model, train, method="map", restarts=1, steps=steps, progress=True)
     spent = time.perf_counter() - begin
     lines = [
         f"One start, {steps} steps of Adam at {step:.2f} s each and the linear fits before them: "

@@ -13,7 +13,7 @@ from pyro_dynogp.lti.response import mean_response
 
 Signal = Callable[[np.ndarray], np.ndarray]
 GUIDES = ("collapsed", "gauss-markov", "inducing times")
-TRAINING, TOTAL, STEP = 800, 1600, 0.05
+TRAINING, TOTAL, STEP = 400, 1000, 0.05
 NOISE = 0.05  # of the output's standard deviation
 
 
