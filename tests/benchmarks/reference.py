@@ -59,7 +59,7 @@ def run(folder: Path) -> str:
         if name in nodes and name not in values
     }
     chains = sample_posterior(
-        explicit, data, values, chains=2, draws=500, warmup=500, seed=0, progress=True
+        explicit, data, values, chains=2, draws=300, warmup=300, seed=0, progress=True
     )
     exact = {k: v.flatten(0, 1) for k, v in chains.draws.items()}
     lines = [
