@@ -54,7 +54,7 @@ def _run_chain(task: _Task) -> tuple[Tensor, int]:
     """Unconstrained draws (draws, d) and the number of divergences of one chain."""
     with seeded(task.seed):
         potential = Potential(task.model, (task.records,), task.values)
-        centre, root = torch.as_tensor(task.centre), torch.as_tensor(task.root)
+        centre, root = torch.tensor(task.centre), torch.tensor(task.root)
 
         def energy(parameters: dict[str, Tensor]) -> Tensor:
             x = parameters["x"]
