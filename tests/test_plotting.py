@@ -415,7 +415,7 @@ def test_history(map_fit):
     np.testing.assert_array_equal(axes.lines[0].get_ydata(), map_fit.history)
     assert axes.get_ylabel() == "-log p(outputs, parameters) [nats]"
     noisy = dataclasses.replace(
-        map_fit, method="svi", history=np.r_[-1e6, np.linspace(-5, 0, 199)], gaussian=None
+        map_fit, method="svi", history=np.r_[-1e6, np.linspace(-5, 0, 199)], posterior=None
     )
     (axes,) = plotting.history(noisy).axes
     x, mean = line(axes, "mean of the last 50")

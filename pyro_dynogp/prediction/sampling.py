@@ -172,10 +172,20 @@ def _static(
     function = layer.function
     support = support_points(function.locations, spec.support)
     if function.channels > 1:
-        mean, variance = function.moments(x)
-        if not switches.functions:
-            return mean, mean, torch.zeros_like(variance)
-        return function.path(x, residual, support), mean, variance
+
+        def at(part: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            mean, variance = function.moments(part)
+            if not switches.functions:
+                return mean, mean, torch.zeros_like(variance)
+            return function.path(part, residual, support), mean, variance
+
+        # Stretch by stretch: kernel matrices of all points at once would not fit.
+        points = x.shape[:-2].numel() * (function.locations.shape[-2] + support.shape[-2])
+        stretches = x.split(max(1, KERNEL_ENTRIES // points), -2)
+        value, mean, variance = (
+            torch.cat(part, -2) for part in zip(*map(at, stretches), strict=True)
+        )
+        return value, mean, variance
     # Functions of one channel are read off a fine grid: far fewer kernel evaluations.
     batch = function.batch_shape
     over = tuple(range(x.dim() - 2 - len(batch)))
@@ -195,6 +205,8 @@ def _static(
     )
 
 
+# Most entries of a kernel matrix along a trajectory (32 MB).
+KERNEL_ENTRIES = 4_000_000
 # Points of the grid that a function of one channel is read off.
 FINE = 1025
 

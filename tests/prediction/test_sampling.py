@@ -8,6 +8,7 @@ import torch
 from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.models.collapsed import assemble
 from pyro_dynogp.models.layers import Dynamic, Static
+from pyro_dynogp.prediction import sampling
 from pyro_dynogp.prediction.sampling import (
     JointState,
     Randomness,
@@ -138,3 +139,25 @@ def test_known_start_orders_real_parts_before_imaginary_ones():
     state = system.layer("g2").first_state
     assert start.shape == (8,)
     assert torch.equal(start, torch.cat([0 * state.real, state.real, 0 * state.imag, state.imag]))
+
+
+def test_functions_of_several_channels_stretch_by_stretch(monkeypatch):
+    """Small kernel matrices of a few samples each give what one large matrix gives."""
+    system, _, _, grid, u, start = cascade()
+    random = random_numbers(system, len(grid), 5)
+    on = Switches.all_on(system)
+    whole = draw_layers(system, grid, u, start, random, on)
+    sizes = []
+    kernel = type(system.layer("f").function).moments
+    monkeypatch.setattr(
+        type(system.layer("f").function),
+        "moments",
+        lambda self, x: sizes.append(x.shape[-2]) or kernel(self, x),
+    )
+    monkeypatch.setattr(sampling, "KERNEL_ENTRIES", 400)
+    parts = draw_layers(system, grid, u, start, random, on)
+    assert max(sizes) < len(grid) == sum(sizes)
+    for name, value in whole.signals.items():
+        assert_close(parts.signals[name], value, rtol=1e-9)
+    assert_close(parts.mean, whole.mean, rtol=1e-9)
+    assert_close(parts.variance, whole.variance, rtol=1e-9)
