@@ -177,12 +177,12 @@ def test_nuts_one_pair_of_300_samples(one_pair):
     record = simulate_record(one_pair, 0.1, n=300, seed=2)
     model = dgp.LinearDynamicGP(inputs=1, pairs=1)
     options = {"restarts": 2, "progress": False}
-    nuts = dgp.fit(model, record, method="nuts", chains=4, draws=300, warmup=150, seed=1, **options)
+    nuts = dgp.fit(model, record, method="nuts", chains=4, draws=400, warmup=300, seed=1, **options)
     r_hat = {k: v for k, v in nuts.diagnostics.items() if k.startswith("r_hat")}
     assert len(r_hat) == 8
     assert max(r_hat.values()) < 1.01, r_hat
     assert nuts.diagnostics["divergences"] <= 2
-    assert nuts.draws["noise_sd"].shape == (1200, 1)
+    assert nuts.draws["noise_sd"].shape == (1600, 1)
     svi = dgp.fit(model, record, method="svi", steps=400, draws=400, workers=1, **options)
     for name in ("g_log_decay", "g_log_frequency", "g_input_gain", "noise_sd"):
         exact, approximate = nuts.draws[name], svi.draws[name]
