@@ -260,7 +260,7 @@ def _common(
         "mode": MappingProxyType(optima[0].values),
         "start_energies": np.array([optimum.energy for optimum in optima]),
         "seed": seed,
-        "training": tuple(one.fingerprint for one in records),
+        "records": tuple(records),
     }
 
 

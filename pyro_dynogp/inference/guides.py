@@ -11,6 +11,7 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
+from pyro_dynogp._errors import invalid
 from pyro_dynogp.inference.potential import Potential, parts
 
 
@@ -89,6 +90,19 @@ class GaussianGuide:
             )
         return values
 
+    def log_prob(self, values: Mapping[str, Tensor]) -> Tensor:
+        """Log-density (*s) of constrained values (*s, *shape) of all sites."""
+        z, log_jacobian = [], torch.zeros((), dtype=torch.float64)
+        for site in self.sites:
+            value = values[site.name]
+            lead = value.shape[: value.dim() - len(site.shape)]
+            part = site.transform.inv(value)
+            jacobian = site.transform.log_abs_det_jacobian(part, value)
+            log_jacobian = log_jacobian + jacobian.reshape((*lead, -1)).sum(-1)
+            z.append(part.reshape((*lead, -1)))
+        normal = dist.MultivariateNormal(self.loc, scale_tril=self.scale_tril)
+        return normal.log_prob(torch.cat(z, -1)) - log_jacobian
+
 
 @dataclass(frozen=True)
 class MixtureGuide:
@@ -128,6 +142,29 @@ class MixtureGuide:
         point = PointGuide({name: x[k] for name, x in self.points.items()}, k.dim())
         normal = GaussianGuide(self.loc[k], self.scale_tril[k], self.sites)
         return {**point(*args), **normal(*args)}
+
+    def optimum(self, values: Mapping[str, Tensor]) -> Tensor:
+        """Which optimum (S,) each of S draws belongs to.
+
+        Raises:
+            ValueError: where a draw is at none of them.
+        """
+        count = next(iter(values.values())).shape[0]
+        equal = torch.ones(count, len(self.weights), dtype=torch.bool)
+        for name, at in self.points.items():
+            same = values[name].unsqueeze(1) == at
+            equal &= same.reshape(count, len(self.weights), -1).all(-1)
+        if not bool(equal.any(-1).all()):
+            raise invalid(
+                "values", expected="draws of this guide", got="values at none of its optima"
+            )
+        return equal.to(torch.int64).argmax(-1)
+
+    def log_prob(self, values: Mapping[str, Tensor]) -> Tensor:
+        """Log-density (S,) of S draws: of the free sites at their optimum, and of the optimum."""
+        k = self.optimum(values)
+        normal = GaussianGuide(self.loc[k], self.scale_tril[k], self.sites)
+        return normal.log_prob(values) + self.weights.log()[k]
 
 
 def gaussian_guide(potential: Potential, loc: Tensor, scale_tril: Tensor) -> GaussianGuide:

@@ -142,8 +142,8 @@ def _run(task: _Task) -> Piece:
                 layers={one.name: one.described for one in task.model.wires},
             )
             with seeded(task.seed):
-                draws = _draw(guide, args, task.draws, vectorised=not own)
-        return _pack(trained, draws)
+                draws, log_q = _draw(guide, args, task.draws, vectorised=not own)
+        return _pack(trained, draws, log_q)
 
     return task.checkpoints.piece(f"{task.key}-result", compute)
 
@@ -157,33 +157,42 @@ def _several(records: Record | tuple[Record, ...]) -> tuple[Record, ...]:
     return (records,) if isinstance(records, Record) else records
 
 
-def _pack(trained: Trained, draws: Values) -> Piece:
+def _pack(trained: Trained, draws: Values, log_q: Values) -> Piece:
     return {
         "elbo": torch.tensor(trained.elbo, dtype=torch.float64),
         **{f"draw/{name}": value for name, value in draws.items()},
+        **{f"log_q/{name}": value for name, value in log_q.items()},
     }
 
 
-def _draw(guide: Callable[..., Any], args: Any, count: int, *, vectorised: bool) -> Values:
-    """Draws (S, *shape) of every latent site."""
+def _draw(
+    guide: Callable[..., Any], args: Any, count: int, *, vectorised: bool
+) -> tuple[Values, Values]:
+    """Draws (S, *shape) of every latent site, and the log-density (S,) of every site's draws."""
 
-    def latent(trace: Any) -> Values:
-        return {
-            name: node["value"]
+    def latent(trace: Any) -> tuple[Values, Values]:
+        trace.compute_log_prob()
+        sites = {
+            name: node
             for name, node in trace.nodes.items()
             if node["type"] == "sample"
             and not node["is_observed"]
-            and not node["infer"].get("is_auxiliary")
             and type(node["fn"]).__name__ != "_Subsample"
         }
+        own = {n: s["value"] for n, s in sites.items() if not s["infer"].get("is_auxiliary")}
+        return own, {name: site["log_prob"] for name, site in sites.items()}
+
+    def stack(traces: Sequence[Values]) -> Values:
+        return {name: torch.stack([one[name] for one in traces]) for name in traces[0]}
 
     with torch.no_grad():
         if vectorised:
             with pyro.plate("draws", count, dim=-1):
-                found = latent(pyro.poutine.trace(guide).get_trace(*args))
-            return {k: v for k, v in found.items() if k != "draws"}
+                draws, log_q = latent(pyro.poutine.trace(guide).get_trace(*args))
+            return draws, {k: v.expand(count) for k, v in log_q.items()}
         traces = [latent(pyro.poutine.trace(guide).get_trace(*args)) for _ in range(count)]
-    return {name: torch.stack([one[name] for one in traces]) for name in traces[0]}
+    log_q = stack([{k: v.sum() for k, v in one.items()} for _, one in traces])
+    return stack([own for own, _ in traces]), log_q
 
 
 def starting_trajectories(model: Cascade, records: Sequence[Record], values: Values) -> Values:
@@ -299,8 +308,11 @@ def fit_layered(
         start_energies=-np.array(levels)[order],
         diagnostics=MappingProxyType({"elbo": float(tail.mean()), "elbo_sd": float(tail.std())}),
         seed=seed,
-        training=tuple(one.fingerprint for one in records),
+        records=tuple(records),
         trajectories=MappingProxyType({k: v for k, v in sampled.items() if k not in kept}),
+        log_q_sites=MappingProxyType(
+            {k[len("log_q/") :]: v for k, v in best.items() if k.startswith("log_q/")}
+        ),
     )
 
 

@@ -51,10 +51,12 @@ class Fit:
             sites), best first.
         diagnostics: what the method says about itself, numbers by name.
         seed: the seed.
-        training: fingerprints of the training records.
+        records: the training records.
         posterior: the variational posterior ("svi" without trajectories as sites).
         trajectories: (S, ...) draws of trajectories and other sites that belong to the training
             record, where the guide had them.
+        log_q_sites: (S,) log-density of the draws of each site, auxiliary ones of the guide too,
+            where the guide had trajectories as sites [nats].
     """
 
     model: LinearDynamicGP | Cascade
@@ -65,9 +67,15 @@ class Fit:
     start_energies: np.ndarray
     diagnostics: Mapping[str, float]
     seed: int
-    training: tuple[str, ...]
+    records: tuple[Record, ...]
     posterior: GaussianGuide | MixtureGuide | None = field(default=None)
     trajectories: Mapping[str, Tensor] = field(default_factory=dict)
+    log_q_sites: Mapping[str, Tensor] = field(default_factory=dict)
+
+    @property
+    def training(self) -> tuple[str, ...]:
+        """Fingerprints of the training records."""
+        return tuple(record.fingerprint for record in self.records)
 
     @property
     def scaling(self) -> Scaling:

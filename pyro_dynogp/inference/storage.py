@@ -10,6 +10,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 import pyro
 import torch
 from safetensors import SafetensorError, safe_open
@@ -23,13 +24,14 @@ from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.layers import Dynamic, Layer, Static
 from pyro_dynogp.models.linear import LinearDynamicGP
+from pyro_dynogp.record import Record
 from pyro_dynogp.scaling import Scaling
 
 if TYPE_CHECKING:
     from pyro_dynogp.inference.result import Fit
 
 FORMAT = "pyro_dynogp.fit"
-VERSION = 2
+VERSION = 3
 # The models that a file may name: a file never decides what code is run.
 MODELS = {"Cascade": Cascade, "LinearDynamicGP": LinearDynamicGP}
 LAYERS: dict[str, type[Dynamic] | type[Static]] = {"Dynamic": Dynamic, "Static": Static}
@@ -54,6 +56,9 @@ def save(fit: Fit, path: str | Path) -> None:
         points = fit.posterior.points
         tensors["posterior/weights"] = fit.posterior.weights
         tensors |= {f"point/{name}": value for name, value in points.items()}
+    for index, record in enumerate(fit.records):
+        tensors |= _arrays(record, f"record/{index}")
+    tensors |= {f"log_q/{name}": value for name, value in fit.log_q_sites.items()}
     header = {
         "format": FORMAT,
         "version": VERSION,
@@ -62,7 +67,8 @@ def save(fit: Fit, path: str | Path) -> None:
         "scaling": fit.scaling.to_dict(),
         "method": fit.method,
         "seed": fit.seed,
-        "training": list(fit.training),
+        "records": [_labels(record) for record in fit.records],
+        "log_q": list(fit.log_q_sites),
         "diagnostics": dict(fit.diagnostics),
         "sites": list(fit.draws),
         "points": list(points),
@@ -171,7 +177,7 @@ def _restore(kind: type[Fit], header: dict[str, Any], tensors: dict[str, Any]) -
     points = {site: tensors[f"point/{site}"] for site in header["points"]}
     posterior: GaussianGuide | MixtureGuide | None = None
     if "posterior/loc" in tensors:
-        sites = _sites(model, scaling, mode, points, len(header["training"]))
+        sites = _sites(model, scaling, mode, points, len(header["records"]))
         normal = tensors["posterior/loc"], tensors["posterior/scale_tril"], sites
         posterior = GaussianGuide(*normal)
         if "posterior/weights" in tensors:
@@ -185,9 +191,45 @@ def _restore(kind: type[Fit], header: dict[str, Any], tensors: dict[str, Any]) -
         start_energies=tensors["start_energies"].numpy(),
         diagnostics=MappingProxyType(header["diagnostics"]),
         seed=header["seed"],
-        training=tuple(header["training"]),
+        records=tuple(
+            _record(labels, tensors, f"record/{index}")
+            for index, labels in enumerate(header["records"])
+        ),
         posterior=posterior,
+        log_q_sites=MappingProxyType({name: tensors[f"log_q/{name}"] for name in header["log_q"]}),
     )
+
+
+def _arrays(record: Record, key: str) -> dict[str, Tensor]:
+    """The numbers of a record."""
+    arrays = {"time": record.time, "inputs": record.inputs, "outputs": record.outputs}
+    arrays |= {f"extra/{name}": values for name, values in record.extra.items()}
+    return {f"{key}/{name}": torch.tensor(values) for name, values in arrays.items()}
+
+
+_TEXTS = ("input_names", "output_names", "input_units", "output_units", "time_unit", "name")
+
+
+def _labels(record: Record) -> dict[str, Any]:
+    """Everything else of a record, as JSON has it."""
+    labels = {name: getattr(record, name) for name in _TEXTS}
+    labels["extra_units"] = dict(record.extra_units)
+    if record.start is not None:
+        labels["start"] = [record.start.isoformat(), str(record.start.tz)]
+    return labels
+
+
+def _record(labels: Mapping[str, Any], tensors: Mapping[str, Tensor], key: str) -> Record:
+    """Inverse of `_arrays` and `_labels`."""
+    given = dict(labels)
+    if "start" in given:
+        instant, zone = given["start"]
+        given["start"] = pd.Timestamp(instant).tz_convert(zone)
+    extra = {name: tensors[f"{key}/extra/{name}"].numpy() for name in given["extra_units"]}
+    time, inputs, outputs = (
+        tensors[f"{key}/{name}"].numpy() for name in ("time", "inputs", "outputs")
+    )
+    return Record(time, inputs, outputs, extra=extra, **given)
 
 
 def _sites(

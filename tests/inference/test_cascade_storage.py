@@ -42,7 +42,7 @@ def prior_fit(model, *records):
         start_energies=np.array([1.0]),
         diagnostics=MappingProxyType({"iterations": 2.0}),
         seed=0,
-        training=tuple(record.fingerprint for record in records),
+        records=tuple(records),
     )
 
 

@@ -93,3 +93,40 @@ def test_saved_and_loaded_with_all_optima(several, tmp_path, bent):
     assert torch.equal(again.posterior.scale_tril, several.posterior.scale_tril)
     assert again.posterior.points.keys() == several.posterior.points.keys()
     assert np.array_equal(several.simulate(bent).mean, again.simulate(bent).mean)
+
+
+def total(guide, *args, count=7):
+    """Draws (count, ...) of a guide with the trace's own log density (count,) of all sites."""
+    with torch.random.fork_rng(), torch.no_grad(), pyro.plate("draws", count, dim=-1):
+        torch.manual_seed(4)
+        trace = pyro.poutine.trace(guide).get_trace(*args)
+    trace.compute_log_prob()
+    sites = {n: s for n, s in trace.nodes.items() if s["type"] == "sample" and n != "draws"}
+    own = {n: s["value"] for n, s in sites.items() if not s["infer"].get("is_auxiliary")}
+    return own, sum(site["log_prob"] for site in sites.values())
+
+
+def test_log_prob_of_draws_is_that_of_the_trace(several):
+    draws, expected = total(several.posterior)
+    torch.testing.assert_close(several.posterior.log_prob(draws), expected, rtol=1e-10, atol=1e-8)
+    with pytest.raises(ValueError, match="none of its optima"):
+        several.posterior.optimum({**draws, "g_log_decay": draws["g_log_decay"] + 1.0})
+
+
+def test_log_prob_of_a_single_normal(svi_fit):
+    draws, expected = total(svi_fit.posterior)
+    torch.testing.assert_close(svi_fit.posterior.log_prob(draws), expected, rtol=1e-10, atol=1e-8)
+
+
+def test_log_density_of_every_site_is_kept_with_trajectories(layered_fit):
+    """Of single draws: the mean of log q of a parameter is its entropy with the sign changed."""
+    names = set(layered_fit.draws) | set(layered_fit.trajectories)
+    assert names <= set(layered_fit.log_q_sites)
+    count = len(layered_fit.draws["noise_sd"])
+    assert all(v.shape == (count,) for v in layered_fit.log_q_sites.values())
+    noise = layered_fit.draws["noise_sd"][:, 0].log()
+    # Normal on the log scale: log q is quadratic in log(noise_sd), but for the Jacobian.
+    z = (layered_fit.log_q_sites["noise_sd"] + noise).numpy()
+    fitted = np.polynomial.Polynomial.fit(noise.numpy(), z, 2)
+    np.testing.assert_allclose(fitted(noise.numpy()), z, atol=1e-8)
+    assert fitted.convert().coef[2] < 0

@@ -1,8 +1,10 @@
 """Saved fits: exact round trip, and files that are refused."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
@@ -20,6 +22,7 @@ def test_exact_round_trip(name, request, tmp_path, record, two_outputs):
     assert again.model == fit.model
     assert again.method == fit.method
     assert dict(again.diagnostics) == dict(fit.diagnostics)
+    assert again.records == fit.records
     assert again.training == fit.training
     for site in fit.draws:
         assert torch.equal(again.draws[site], fit.draws[site])
@@ -98,3 +101,24 @@ def test_incomplete_and_unknown_models_are_refused(tmp_path, map_fit):
     write(tmp_path / "unknown", {FORMAT: json.dumps(header)}, tensors)
     with pytest.raises(ValueError, match="unknown model"):
         dgp.load(tmp_path / "unknown")
+
+
+def test_training_records_come_back_with_names_units_and_clock(map_fit, record, tmp_path):
+    stamps = pd.date_range("2024-03-31 00:30", periods=len(record), freq="10min", tz="Europe/Berlin")
+    full = dgp.Record(
+        stamps,
+        record.inputs,
+        np.where(np.arange(len(record))[:, None] == 7, np.nan, record.outputs),
+        input_names=["valve"],
+        output_names=["level"],
+        input_units=["V"],
+        output_units=["m"],
+        extra={"room": np.sin(record.time)},
+        extra_units={"room": "degC"},
+        name="night",
+    )
+    replace(map_fit, records=(full, full[:50])).save(tmp_path / "fit")
+    again = dgp.load(tmp_path / "fit").records
+    assert again == (full, full[:50])
+    assert again[0].name == "night"
+    assert again[0].timestamps.equals(full.timestamps)

@@ -36,7 +36,7 @@ def fit_of(model, draws, scaling):
         start_energies=np.zeros(1),
         diagnostics=MappingProxyType({}),
         seed=0,
-        training=(),
+        records=(),
     )
 
 
