@@ -82,8 +82,14 @@ def predict_ahead(layout, values, horizon):
 
 
 @njit(**OPTIONS)
-def _before_outputs(time, layout, values, bar, L, work, C, alphas, betas, m, P, t):
-    """Take lambda (A,) and Lambda (A, A) back over the outputs of a sample, undone in m and P."""
+def _before_outputs(time, layout, values, bar, L, work, C, alphas, betas, m, P, t, cavity):
+    """Take lambda (A,) and Lambda (A, A) back over the outputs of a sample, undone in m and P.
+
+    Writes to cavity (2, n, n_y) mean and variance of each noise-free output given all data but its
+    own sample. The information of later data does not depend on what the filter knew before: with
+    q = c'Lambda c and l = c'lambda after the update, the Woodbury identity gives the mean
+    m + (l + alpha q)/(1 + beta q) and the variance s - q/(1 + beta q) before it.
+    """
     A = bar.shape[0]
     for o in range(values.y.shape[1] - 1, -1, -1):
         if math.isnan(values.y[time, o]):
@@ -92,10 +98,14 @@ def _before_outputs(time, layout, values, bar, L, work, C, alphas, betas, m, P, 
         c = C[o]
         update(P, m, c, -alphas[o], -betas[o])
         along = dot(c, bar)
+        covary(L, c, t)
+        q = dot(c, t)
+        kept = 1.0 / (1.0 + betas[o] * q)
+        cavity[0, time, o] = dot(h, m) + values.y_offset[time, o] + kept * (along + alphas[o] * q)
+        cavity[1, time, o] = max(dot(h, c) - kept * q, 0.0)
         for j in range(A):
             bar[j] += (alphas[o] - betas[o] * along) * h[j]
-        covary(L, c, t)
-        both = betas[o] * (1.0 + betas[o] * dot(c, t))
+        both = betas[o] * (1.0 + betas[o] * q)
         for j in range(A):
             for k in range(A):
                 L[j, k] += both * h[j] * h[k] - betas[o] * (h[j] * t[k] + t[j] * h[k])
@@ -136,6 +146,24 @@ def smooth(layout, values, rows, means, covariances):
 
     means, covariances: what `recursion.run` kept at the segments.
     """
+    mean, variance, _ = _backwards(layout, values, rows, means, covariances)
+    return mean, variance
+
+
+@njit(**OPTIONS)
+def leave_one_out(layout, values, means, covariances):
+    """Mean and variance (n, n_y) of each noise-free output given all data but its own sample.
+
+    NaN where the sample is missing. Exact for linear cascades with Gaussian noise.
+    """
+    rows = np.empty((0, values.G.shape[1]))
+    _, _, cavity = _backwards(layout, values, rows, means, covariances)
+    return cavity[0], cavity[1]
+
+
+@njit(**OPTIONS)
+def _backwards(layout, values, rows, means, covariances):
+    """What `smooth` and `leave_one_out` return, from one pass."""
     n = layout.step.shape[0]
     n_y = values.y.shape[1]
     N = values.m0.shape[0]
@@ -145,6 +173,7 @@ def smooth(layout, values, rows, means, covariances):
     pairs = N // 2
     mean = np.empty((n, A))
     variance = np.empty((n, rows.shape[0]))
+    cavity = np.full((2, n, n_y), np.nan)
     m = np.zeros(A)
     P = np.zeros((A, A))
     bar = np.zeros(A)
@@ -230,10 +259,10 @@ def smooth(layout, values, rows, means, covariances):
             for row in range(rows.shape[0]):
                 covary(P, rows[row], c)
                 variance[time, row] = max(dot(rows[row], c) - _quadratic(L, c, t), 0.0)
-            _before_outputs(time, layout, values, bar, L, work, C, alphas, betas, m, P, t)
+            _before_outputs(time, layout, values, bar, L, work, C, alphas, betas, m, P, t, cavity)
             for i in range(S - 1, -1, -1):
                 _before_layer(i, layout, values, bar, L, work, t)
-    return mean, variance
+    return mean, variance, cavity
 
 
 @njit(**OPTIONS)

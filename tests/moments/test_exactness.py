@@ -133,6 +133,24 @@ def test_smoothed_signals(name, noise):
 
 
 @every_case
+def test_leave_one_out(name, noise):
+    """Each noise-free output given all samples but its own, with those of the same time."""
+    case = case_of(name, noise)
+    _, means, covariances, _, _ = recursion.run(case.problem.layout, case.values)
+    mean, variance = smoothing.leave_one_out(case.problem.layout, case.values, means, covariances)
+    there = ~np.isnan(case.y)
+    assert np.array_equal(~np.isnan(mean), there)
+    assert np.array_equal(~np.isnan(variance), there)
+    i = case.joint.index(case.last)
+    for k, o in zip(*np.nonzero(there), strict=True):
+        seen = there.copy()
+        seen[k, o] = False
+        exact, P = case.joint.given(case.last, case.sd, case.y - case.offset, seen)
+        assert mean[k, o] == pytest.approx(exact[i[k, o]] + case.offset[o], rel=1e-7, abs=1e-9)
+        assert variance[k, o] == pytest.approx(P[i[k, o], i[k, o]], rel=1e-7)
+
+
+@every_case
 def test_predictions_and_innovations(name, noise):
     case = case_of(name, noise)
     layout, values = case.problem.layout, case.values
