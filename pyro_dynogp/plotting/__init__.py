@@ -4,6 +4,7 @@ Every function returns a matplotlib Figure that belongs to nobody else: no pyplo
 no display needed. Save it with ``figure.savefig("name.png")``; a notebook shows it as it is.
 """
 
+from pyro_dynogp.plotting.calibration import calibration, predictive_checks
 from pyro_dynogp.plotting.diagnostics import history, residuals, starts
 from pyro_dynogp.plotting.signals import prediction, record
 from pyro_dynogp.plotting.style import named
@@ -11,11 +12,13 @@ from pyro_dynogp.plotting.systems import bode, impulse_response, pole_map
 
 __all__ = [
     "bode",
+    "calibration",
     "history",
     "impulse_response",
     "named",
     "pole_map",
     "prediction",
+    "predictive_checks",
     "record",
     "residuals",
     "starts",

@@ -1,0 +1,1 @@
+"""Criticism of fits: ArviZ, predictive densities of left-out data, calibration, verdicts."""

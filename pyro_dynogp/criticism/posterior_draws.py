@@ -1,0 +1,212 @@
+"""Draws of all parameters with the densities that importance sampling needs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyro
+import torch
+from scipy.special import logsumexp
+from torch import Tensor
+
+from pyro_dynogp._errors import invalid
+from pyro_dynogp.inference.guides import GaussianGuide, MixtureGuide, gaussian_guide
+from pyro_dynogp.inference.potential import Potential
+from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
+from pyro_dynogp.models.cascade import Cascade
+from pyro_dynogp.parallel import seeded
+from pyro_dynogp.record import Record
+
+if TYPE_CHECKING:
+    from pyro_dynogp.inference.result import Fit
+
+Values = Mapping[str, Tensor]
+# Widest standard deviation of a Laplace approximation, in unconstrained units, where the density
+# is flat: priors are about as wide.
+WIDEST = 1.5
+# Samples times draws that are evaluated at once.
+AT_ONCE = 4_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class PosteriorDraws:
+    """Draws of every latent site, and how probable they are.
+
+    Attributes:
+        values: (S, *shape) of each site.
+        log_p: (S,) log p(y, values) [nats], None where it is not known.
+        log_q: (S,) log-density under what they were drawn from; None for draws of the posterior
+            itself (MCMC).
+        group: (S,) optimum that each draw belongs to.
+        kind: where they come from, in words.
+    """
+
+    values: Values
+    log_p: np.ndarray | None
+    log_q: np.ndarray | None
+    group: np.ndarray
+    kind: str
+
+    def __len__(self) -> int:
+        return len(self.group)
+
+    @property
+    def log_ratio(self) -> np.ndarray:
+        """Log importance ratios (S,) of the posterior over what the draws come from.
+
+        Up to a constant for each optimum: how much each optimum weighs is for the fit to say, and
+        its ratios say how well its draws describe the posterior around it.
+        """
+        if self.log_q is None or self.log_p is None:
+            return np.zeros(len(self))
+        ratio = self.log_p - self.log_q
+        out = np.empty_like(ratio)
+        for one in np.unique(self.group):
+            own = self.group == one
+            out[own] = ratio[own] - (logsumexp(ratio[own]) - np.log(own.sum()))
+        return out
+
+
+def draws_of(fit: Fit, *, count: int = 400, seed: int = 0) -> PosteriorDraws:
+    """Draws of all parameters of a fit.
+
+    NUTS: its draws. A variational posterior of all sites: fresh draws. Where the fit is a posterior
+    mode, or keeps some sites at one: Laplace's approximation of all sites around each optimum,
+    since what is fixed at a value that has seen the data cannot tell what it would be without.
+
+    Args:
+        fit: the fit. count: number of draws S (of NUTS all there are). seed: for them.
+    """
+    if fit.method == "nuts":
+        n = len(next(iter(fit.draws.values())))
+        return PosteriorDraws(fit.draws, None, None, np.zeros(n, dtype=int), "NUTS")
+    if fit.log_q_sites:
+        log_q = sum(v for name, v in fit.log_q_sites.items() if name not in fit.trajectories)
+        assert isinstance(log_q, Tensor)
+        return PosteriorDraws(
+            fit.draws,
+            log_joint(fit, fit.draws),
+            log_q.numpy(),
+            np.zeros(len(log_q), dtype=int),
+            "SVI with trajectories as sites",
+        )
+    if isinstance(fit.posterior, GaussianGuide):
+        return _of_normals(fit, [(1.0, fit.posterior)], count, seed, "SVI, multivariate normal")
+    normals = [(weight, laplace(fit, values)) for weight, values in optima_of(fit)]
+    return _of_normals(fit, normals, count, seed, "Laplace's approximation")
+
+
+def optima_of(fit: Fit) -> list[tuple[float, Values]]:
+    """Optima that a fit consists of: weight, and values of all sites."""
+    posterior = fit.posterior
+    if not isinstance(posterior, MixtureGuide):
+        return [(1.0, fit.mode)]
+    found = []
+    for k, weight in enumerate(posterior.weights.tolist()):
+        centre = GaussianGuide(posterior.loc[k], posterior.scale_tril[k], posterior.sites)
+        free = centre.values_at(posterior.loc[k])
+        found.append((weight, {**{n: x[k] for n, x in posterior.points.items()}, **free}))
+    return found
+
+
+def laplace(fit: Fit, values: Values) -> GaussianGuide:
+    """Normal around an optimum, from the Hessian of the log joint density there."""
+    with seeded(fit.seed):
+        potential = Potential(_target(fit), (_argument(fit.records),), values)
+        centre, root = potential.laplace(values, widest=WIDEST)
+    return gaussian_guide(potential, torch.as_tensor(centre), torch.as_tensor(root))
+
+
+def _of_normals(
+    fit: Fit, normals: Sequence[tuple[float, GaussianGuide]], count: int, seed: int, kind: str
+) -> PosteriorDraws:
+    """Draws of each normal in its share."""
+    weights = np.array([weight for weight, _ in normals])
+    shares = np.maximum(np.floor(count * weights / weights.sum()).astype(int), 1)
+    shares[0] += max(count - shares.sum(), 0)
+    values: list[Values] = []
+    log_q: list[Tensor] = []
+    with seeded(seed), torch.no_grad():
+        for share, (_, normal) in zip(shares, normals, strict=True):
+            noise = torch.randn(int(share), len(normal.loc), dtype=torch.float64)
+            drawn = normal.values_at(normal.loc + noise @ normal.scale_tril.mT)
+            values.append(drawn)
+            log_q.append(normal.log_prob(drawn))
+    joined = MappingProxyType({n: torch.cat([one[n] for one in values]) for n in values[0]})
+    return PosteriorDraws(
+        joined,
+        log_joint(fit, joined),
+        torch.cat(log_q).numpy(),
+        np.repeat(np.arange(len(normals)), shares),
+        kind,
+    )
+
+
+def log_joint(fit: Fit, values: Values) -> np.ndarray:
+    """Log p(y, values) (S,) of draws, y the training records; -inf where it has no value."""
+    return log_joint_of(_target(fit), (_argument(fit.records),), values, _samples(fit.records))
+
+
+def log_joint_of(
+    model: Any, args: tuple[Any, ...], values: Values, samples: int = 1000
+) -> np.ndarray:
+    """Log-density (S,) of a Pyro model at S draws of its latent sites, those of the data included.
+
+    Draws go through the model together where it broadcasts, in portions of bounded memory.
+    """
+    count = len(next(iter(values.values())))
+    portion = max(1, AT_ONCE // max(samples, 1))
+    parts = []
+    for first in range(0, count, portion):
+        some = {name: x[first : first + portion] for name, x in values.items()}
+        parts.append(_portion(model, args, some))
+    return np.concatenate(parts)
+
+
+def _portion(model: Any, args: tuple[Any, ...], values: Values) -> np.ndarray:
+    count = len(next(iter(values.values())))
+    try:
+        with torch.no_grad(), pyro.validation_enabled(False):
+            trace = pyro.poutine.trace(pyro.poutine.condition(model, data=dict(values))).get_trace(
+                *args
+            )
+            trace.compute_log_prob()
+    except (NotPositiveDefiniteError, torch.linalg.LinAlgError):
+        if count == 1:  # this draw: the density cannot be evaluated there
+            return np.array([-np.inf])
+        each = [_portion(model, args, {k: v[i : i + 1] for k, v in values.items()}) for i in
+                range(count)]  # fmt: skip
+        return np.concatenate(each)
+    total = np.zeros(count)
+    for name, node in trace.nodes.items():
+        if node["type"] != "sample" or type(node["fn"]).__name__ == "_Subsample":
+            continue
+        if not node["is_observed"] and name not in values:
+            raise invalid("values", expected=f"draws of every site, {name!r} too", got="none of it")
+        log_prob = node["log_prob"].numpy()
+        if log_prob.ndim and log_prob.shape[0] == count:
+            total += log_prob.reshape(count, -1).sum(1)
+        else:
+            total += log_prob.sum()
+    return np.where(np.isfinite(total), total, -np.inf)
+
+
+def at(fit: Fit, draws: PosteriorDraws) -> Fit:
+    """The fit with other draws: predictions from it are those of the draws."""
+    return replace(fit, draws=draws.values, method="svi", posterior=None, log_q_sites={})
+
+
+def _target(fit: Fit) -> Any:
+    return fit.model.collapsed if isinstance(fit.model, Cascade) else fit.model
+
+
+def _argument(records: Sequence[Record]) -> Any:
+    return records[0] if len(records) == 1 else tuple(records)
+
+
+def _samples(records: Sequence[Record]) -> int:
+    return sum(len(record) * max(record.n_outputs, 1) for record in records)
