@@ -74,9 +74,9 @@ class PosteriorDraws:
 def draws_of(fit: Fit, *, count: int = 400, seed: int = 0) -> PosteriorDraws:
     """Draws of all parameters of a fit.
 
-    NUTS: its draws. A variational posterior of all sites: fresh draws. Where the fit is a posterior
-    mode, or keeps some sites at one: Laplace's approximation of all sites around each optimum,
-    since what is fixed at a value that has seen the data cannot tell what it would be without.
+    NUTS: its draws. A variational posterior: fresh draws of it; of a cascade by default those of
+    inducing values and first states, with all else at an optimum, whose own uncertainty then
+    counts nowhere. A posterior mode: Laplace's approximation around it.
 
     Args:
         fit: the fit. count: number of draws S (of NUTS all there are). seed: for them.
@@ -95,22 +95,23 @@ def draws_of(fit: Fit, *, count: int = 400, seed: int = 0) -> PosteriorDraws:
             "SVI with trajectories as sites",
         )
     if isinstance(fit.posterior, GaussianGuide):
-        return _of_normals(fit, [(1.0, fit.posterior)], count, seed, "SVI, multivariate normal")
-    normals = [(weight, laplace(fit, values)) for weight, values in optima_of(fit)]
-    return _of_normals(fit, normals, count, seed, "Laplace's approximation")
+        return _of_normal(fit, fit.posterior, count, seed, "SVI, multivariate normal")
+    if isinstance(fit.posterior, MixtureGuide):
+        return _of_optima(fit, fit.posterior, count, seed)
+    return _of_normal(fit, laplace(fit, fit.mode), count, seed, "Laplace's approximation")
 
 
-def optima_of(fit: Fit) -> list[tuple[float, Values]]:
-    """Optima that a fit consists of: weight, and values of all sites."""
-    posterior = fit.posterior
-    if not isinstance(posterior, MixtureGuide):
-        return [(1.0, fit.mode)]
-    found = []
-    for k, weight in enumerate(posterior.weights.tolist()):
-        centre = GaussianGuide(posterior.loc[k], posterior.scale_tril[k], posterior.sites)
-        free = centre.values_at(posterior.loc[k])
-        found.append((weight, {**{n: x[k] for n, x in posterior.points.items()}, **free}))
-    return found
+def _of_optima(fit: Fit, guide: MixtureGuide, count: int, seed: int) -> PosteriorDraws:
+    with seeded(seed), torch.no_grad(), pyro.plate("draws", count, dim=-1):
+        trace = pyro.poutine.trace(guide).get_trace()
+    values = {name: trace.nodes[name]["value"] for name in fit.draws}
+    return PosteriorDraws(
+        MappingProxyType(values),
+        log_joint(fit, values),
+        guide.log_prob(values).numpy(),
+        guide.optimum(values).numpy(),
+        f"SVI, {len(guide.weights)} optima, hyperparameters at each optimum",
+    )
 
 
 def laplace(fit: Fit, values: Values) -> GaussianGuide:
@@ -121,29 +122,12 @@ def laplace(fit: Fit, values: Values) -> GaussianGuide:
     return gaussian_guide(potential, torch.as_tensor(centre), torch.as_tensor(root))
 
 
-def _of_normals(
-    fit: Fit, normals: Sequence[tuple[float, GaussianGuide]], count: int, seed: int, kind: str
-) -> PosteriorDraws:
-    """Draws of each normal in its share."""
-    weights = np.array([weight for weight, _ in normals])
-    shares = np.maximum(np.floor(count * weights / weights.sum()).astype(int), 1)
-    shares[0] += max(count - shares.sum(), 0)
-    values: list[Values] = []
-    log_q: list[Tensor] = []
+def _of_normal(fit: Fit, normal: GaussianGuide, count: int, seed: int, kind: str) -> PosteriorDraws:
     with seeded(seed), torch.no_grad():
-        for share, (_, normal) in zip(shares, normals, strict=True):
-            noise = torch.randn(int(share), len(normal.loc), dtype=torch.float64)
-            drawn = normal.values_at(normal.loc + noise @ normal.scale_tril.mT)
-            values.append(drawn)
-            log_q.append(normal.log_prob(drawn))
-    joined = MappingProxyType({n: torch.cat([one[n] for one in values]) for n in values[0]})
-    return PosteriorDraws(
-        joined,
-        log_joint(fit, joined),
-        torch.cat(log_q).numpy(),
-        np.repeat(np.arange(len(normals)), shares),
-        kind,
-    )
+        noise = torch.randn(count, len(normal.loc), dtype=torch.float64)
+        values = MappingProxyType(normal.values_at(normal.loc + noise @ normal.scale_tril.mT))
+        log_q = normal.log_prob(values).numpy()
+    return PosteriorDraws(values, log_joint(fit, values), log_q, np.zeros(count, dtype=int), kind)
 
 
 def log_joint(fit: Fit, values: Values) -> np.ndarray:
