@@ -1,0 +1,140 @@
+"""All that this package asks of ArviZ (0.21 to 0.23); no other module imports it."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+
+def _arviz() -> Any:
+    """ArviZ, imported when it is first needed: it takes seconds."""
+    with warnings.catch_warnings():
+        # Its notice about version 1, once a day, is not for our users.
+        warnings.simplefilter("ignore", FutureWarning)
+        import arviz
+    return arviz
+
+
+def good_k(draws: int) -> float:
+    """Largest Pareto shape at which importance sampling with S draws is reliable (Vehtari 2024)."""
+    return min(1.0 - 1.0 / np.log10(draws), 0.7) if draws > 10 else 0.0
+
+
+def psis(log_ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pareto-smoothed importance sampling (Vehtari, Simpson, Gelman, Yao & Gabry 2024).
+
+    Args:
+        log_ratio: (..., S) of target over proposal, up to a constant for each row.
+
+    Returns:
+        Normalised log weights (..., S), and Pareto shapes k (...); NaN with fewer than 25 draws
+        and zero where all ratios of a row are equal.
+    """
+    log_ratio = np.asarray(log_ratio, dtype=float)
+    count = log_ratio.shape[-1]
+    flat = log_ratio.reshape(-1, count)
+    flat = flat - flat.max(-1, keepdims=True)
+    out = flat - np.log(np.exp(flat).sum(-1, keepdims=True))
+    k = np.full(len(flat), np.nan)
+    equal = np.ptp(flat, axis=-1) < 1e-12
+    k[equal] = 0.0
+    if count >= 25 and not equal.all():
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of infinite k, which is what we return
+            smoothed, shape = _arviz().psislw(flat[~equal].copy())
+        out[~equal], k[~equal] = smoothed, np.atleast_1d(shape)
+    return out.reshape(log_ratio.shape), k.reshape(log_ratio.shape[:-1])
+
+
+def elpd_data(
+    elpd: np.ndarray,
+    k: np.ndarray,
+    *,
+    lppd: float,
+    draws: int,
+    warning: bool,
+    coords: Mapping[str, np.ndarray],
+    extra: Mapping[str, Any],
+) -> Any:
+    """ArviZ's ELPDData from densities (N,) of single samples.
+
+    Args:
+        elpd: log predictive density of each sample [nats]. k: (N,) Pareto shapes.
+        lppd: log density of all samples with what was fitted to them. draws: S.
+        warning: whether something is not reliable.
+        coords: (N,) what tells the samples apart. extra: further entries.
+    """
+    from arviz.stats.stats_utils import ELPDData
+
+    labels = {name: ("observation", value) for name, value in coords.items()}
+    pointwise = xr.DataArray(elpd, dims="observation", coords=labels, name="loo_i")
+    entries = {
+        "elpd_loo": float(elpd.sum()),
+        "se": float(np.sqrt(len(elpd) * np.var(elpd))),
+        "p_loo": float(lppd - elpd.sum()),
+        "n_samples": draws,
+        "n_data_points": len(elpd),
+        "warning": warning,
+        "loo_i": pointwise,
+        "pareto_k": pointwise.copy(data=k).rename("pareto_shape"),
+        "scale": "log",
+        "good_k": good_k(draws),
+        **extra,
+    }
+    return ELPDData(data=list(entries.values()), index=list(entries))
+
+
+ARVIZ_ENTRIES = (
+    "elpd_loo", "se", "p_loo", "n_samples", "n_data_points", "warning", "loo_i", "pareto_k",
+    "scale", "good_k",
+)  # fmt: skip
+
+
+def compare_table(elpds: Mapping[str, Any], method: str) -> Any:
+    """`arviz.compare` of ELPDData by name, weights by `method`."""
+    from arviz.stats.stats_utils import ELPDData
+
+    plain = {
+        name: ELPDData(data=[one[e] for e in ARVIZ_ENTRIES], index=list(ARVIZ_ENTRIES))
+        for name, one in elpds.items()
+    }
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return _arviz().compare(plain, ic="loo", method=method, scale="log")
+
+
+def inference_data(
+    groups: Mapping[str, Mapping[str, np.ndarray]],
+    coords: Mapping[str, Sequence[Any] | np.ndarray],
+    dims: Mapping[str, Sequence[str]],
+    units: Mapping[str, str],
+    attrs: Mapping[str, Any],
+) -> Any:
+    """ArviZ's InferenceData.
+
+    Args:
+        groups: of variables by group: (chain, draw, *shape); without the first two dimensions in
+            "observed_data", "constant_data" and "predictions_constant_data".
+        coords: labels of dimensions. dims: names of a variable's own dimensions.
+        units: of variables, kept in their attributes. attrs: of the whole.
+    """
+    arviz = _arviz()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        data = arviz.from_dict(
+            **{name: dict(variables) for name, variables in groups.items()},
+            coords={k: np.asarray(v) for k, v in coords.items()},
+            dims={k: list(v) for k, v in dims.items()},
+            pred_dims={k: list(v) for k, v in dims.items()},
+            pred_coords={k: np.asarray(v) for k, v in coords.items()},
+        )
+    for group in data.groups():
+        for name, variable in getattr(data, group).data_vars.items():
+            if name in units:
+                variable.attrs["units"] = units[name]
+        getattr(data, group).attrs.update(attrs)
+    return data
