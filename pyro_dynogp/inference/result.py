@@ -78,6 +78,11 @@ class Fit:
         return tuple(record.fingerprint for record in self.records)
 
     @property
+    def collapsed(self) -> bool:
+        """Whether the fit had all trajectories integrated out."""
+        return not self.log_q_sites
+
+    @property
     def scaling(self) -> Scaling:
         """Learnt from the training records."""
         if self.model.scaling is None:

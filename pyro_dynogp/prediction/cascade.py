@@ -254,7 +254,7 @@ def _forward(
     with seeded(seed):
         random = Randomness.draw(system, len(grid), shape)
     scale, shift = _units(fit)
-    on = Switches.all_on(system, process_noise)
+    on = Switches.all_on(system, process_noise, several_channels=not fit.collapsed)
 
     def at(switches: Switches) -> Drawn:
         return draw_layers(system, grid, inputs, start, random, switches)

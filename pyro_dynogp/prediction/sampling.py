@@ -79,21 +79,27 @@ class Switches:
         initial_state: whether the first state is drawn, or at its mean.
         process_noise: names of the dynamic layers whose process noise acts.
         functions: whether static functions below a dynamic layer are drawn, or at their mean.
+        several_channels: whether those of several channels are, too. The moment-matching filter
+            has them at their mean given the inducing values, since a few inducing points leave
+            much of a space of several channels open; so must what is predicted from such a fit.
     """
 
     initial_state: bool
     process_noise: frozenset[str]
     functions: bool
+    several_channels: bool = False
 
     @classmethod
-    def all_on(cls, system: CascadeSystem, process_noise: bool = True) -> Switches:
-        """Everything acts; process noise only if asked for."""
+    def all_on(
+        cls, system: CascadeSystem, process_noise: bool = True, several_channels: bool = False
+    ) -> Switches:
+        """Everything acts; process noise and functions of several channels only if asked for."""
         names = {
             one.name
             for one, layer in zip(system.wires, system.layers, strict=True)
             if isinstance(layer, DynamicSystem) and layer.modes.L.shape[-1]
         }
-        return cls(True, frozenset(names if process_noise else ()), True)
+        return cls(True, frozenset(names if process_noise else ()), True, several_channels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +181,7 @@ def _static(
 
         def at(part: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             mean, variance = function.moments(part)
-            if not switches.functions:
+            if not (switches.functions and switches.several_channels):
                 return mean, mean, torch.zeros_like(variance)
             return function.path(part, residual, support), mean, variance
 

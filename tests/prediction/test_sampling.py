@@ -1,10 +1,13 @@
 """Trajectories drawn forwards: which cause acts in a draw, and from which state it begins."""
 
+from dataclasses import replace
+
 import numpy as np
 import pyro
 import pytest
 import torch
 
+import pyro_dynogp as dgp
 from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.models.collapsed import assemble
 from pyro_dynogp.models.layers import Dynamic, Static
@@ -145,7 +148,7 @@ def test_functions_of_several_channels_stretch_by_stretch(monkeypatch):
     """Small kernel matrices of a few samples each give what one large matrix gives."""
     system, _, _, grid, u, start = cascade()
     random = random_numbers(system, len(grid), 5)
-    on = Switches.all_on(system)
+    on = Switches.all_on(system, several_channels=True)
     whole = draw_layers(system, grid, u, start, random, on)
     sizes = []
     kernel = type(system.layer("f").function).moments
@@ -161,3 +164,22 @@ def test_functions_of_several_channels_stretch_by_stretch(monkeypatch):
         assert_close(parts.signals[name], value, rtol=1e-9)
     assert_close(parts.mean, whole.mean, rtol=1e-9)
     assert_close(parts.variance, whole.variance, rtol=1e-9)
+
+
+def test_functions_of_several_channels_are_at_their_mean_as_in_the_filter():
+    """Far from the inducing points too, where they are all but unknown."""
+    model = dgp.Cascade(1, [dgp.Dynamic(outputs=2, pairs=1), dgp.Static(outputs=2), dgp.Dynamic()])
+    record = dgp.Record(np.arange(20.0), np.sin(np.arange(20.0)), np.cos(np.arange(20.0)))
+    model = model.scaled_to(record)
+    with torch.random.fork_rng(), torch.no_grad():
+        torch.manual_seed(3)
+        system = model.collapsed.sample_system(model.scaling)
+    grid = time_grid(record.time)
+    u = 30.0 * torch.sin(grid.time).unsqueeze(-1)
+    start = JointState(known_start(system), assemble(system, grid, u).problem.P0)
+    random = random_numbers(system, len(grid), 4)
+    plain = Switches(False, frozenset(), True)
+    by_filter = draw_layers(system, grid, u, start, random, plain).signals["f"]
+    assert torch.equal(by_filter, by_filter[:1].expand_as(by_filter))
+    whole = replace(plain, several_channels=True)
+    assert draw_layers(system, grid, u, start, random, whole).signals["f"].std(0).max() > 0.1
