@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -107,34 +107,16 @@ def compare_table(elpds: Mapping[str, Any], method: str) -> Any:
         return _arviz().compare(plain, ic="loo", method=method, scale="log")
 
 
-def inference_data(
-    groups: Mapping[str, Mapping[str, np.ndarray]],
-    coords: Mapping[str, Sequence[Any] | np.ndarray],
-    dims: Mapping[str, Sequence[str]],
-    units: Mapping[str, str],
-    attrs: Mapping[str, Any],
-) -> Any:
+def inference_data(groups: Mapping[str, xr.Dataset], attrs: Mapping[str, Any]) -> Any:
     """ArviZ's InferenceData.
 
     Args:
-        groups: of variables by group: (chain, draw, *shape); without the first two dimensions in
-            "observed_data", "constant_data" and "predictions_constant_data".
-        coords: labels of dimensions. dims: names of a variable's own dimensions.
-        units: of variables, kept in their attributes. attrs: of the whole.
+        groups: datasets by the name of their group, in any order.
+        attrs: of the whole, repeated in every group, so that a group by itself still has them.
     """
-    arviz = _arviz()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        data = arviz.from_dict(
-            **{name: dict(variables) for name, variables in groups.items()},
-            coords={k: np.asarray(v) for k, v in coords.items()},
-            dims={k: list(v) for k, v in dims.items()},
-            pred_dims={k: list(v) for k, v in dims.items()},
-            pred_coords={k: np.asarray(v) for k, v in coords.items()},
+        return _arviz().InferenceData(
+            attrs=dict(attrs),
+            **{name: group.assign_attrs(attrs) for name, group in groups.items()},
         )
-    for group in data.groups():
-        for name, variable in getattr(data, group).data_vars.items():
-            if name in units:
-                variable.attrs["units"] = units[name]
-        getattr(data, group).attrs.update(attrs)
-    return data

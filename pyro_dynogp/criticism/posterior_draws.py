@@ -14,6 +14,8 @@ from scipy.special import logsumexp
 from torch import Tensor
 
 from pyro_dynogp._errors import invalid
+from pyro_dynogp.criticism import arviz_bridge
+from pyro_dynogp.inference import annealing
 from pyro_dynogp.inference.guides import GaussianGuide, MixtureGuide, gaussian_guide
 from pyro_dynogp.inference.potential import Potential
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
@@ -28,6 +30,8 @@ Values = Mapping[str, Tensor]
 # Widest standard deviation of a Laplace approximation, in unconstrained units, where the density
 # is flat: priors are about as wide.
 WIDEST = 1.5
+# Particles of an annealed posterior.
+PARTICLES = 400
 # Samples times draws that are evaluated at once.
 AT_ONCE = 4_000_000
 
@@ -76,7 +80,9 @@ def draws_of(fit: Fit, *, count: int = 400, seed: int = 0) -> PosteriorDraws:
 
     NUTS: its draws. A variational posterior: fresh draws of it; of a cascade by default those of
     inducing values and first states, with all else at an optimum, whose own uncertainty then
-    counts nowhere. A posterior mode: Laplace's approximation around it.
+    counts nowhere. A posterior mode: Laplace's approximation around it. Where Pareto's k says that
+    a normal does not describe the posterior of a linear model, particles are annealed from it to
+    the posterior itself (`inference.annealing`).
 
     Args:
         fit: the fit. count: number of draws S (of NUTS all there are). seed: for them.
@@ -98,7 +104,8 @@ def draws_of(fit: Fit, *, count: int = 400, seed: int = 0) -> PosteriorDraws:
         return _of_normal(fit, fit.posterior, count, seed, "SVI, multivariate normal")
     if isinstance(fit.posterior, MixtureGuide):
         return _of_optima(fit, fit.posterior, count, seed)
-    return _of_normal(fit, laplace(fit, fit.mode), count, seed, "Laplace's approximation")
+    normal = laplace(fit, fit.mode)
+    return _of_normal(fit, normal, count, seed, "Laplace's approximation")
 
 
 def _of_optima(fit: Fit, guide: MixtureGuide, count: int, seed: int) -> PosteriorDraws:
@@ -123,11 +130,30 @@ def laplace(fit: Fit, values: Values) -> GaussianGuide:
 
 
 def _of_normal(fit: Fit, normal: GaussianGuide, count: int, seed: int, kind: str) -> PosteriorDraws:
+    """Draws of a normal, or of the posterior where a normal will not do."""
     with seeded(seed), torch.no_grad():
         noise = torch.randn(count, len(normal.loc), dtype=torch.float64)
         values = MappingProxyType(normal.values_at(normal.loc + noise @ normal.scale_tril.mT))
         log_q = normal.log_prob(values).numpy()
-    return PosteriorDraws(values, log_joint(fit, values), log_q, np.zeros(count, dtype=int), kind)
+    single = np.zeros(count, dtype=int)
+    drawn = PosteriorDraws(values, log_joint(fit, values), log_q, single, kind)
+    k = float(arviz_bridge.psis(drawn.log_ratio)[1])
+    # A cascade costs too much for that: its draws are left as they are, and k says so.
+    if k <= arviz_bridge.good_k(count) or isinstance(fit.model, Cascade):
+        return drawn
+    particles = min(count, PARTICLES)
+    z, start = annealing.around(normal, particles, seed)
+    target = annealing.Joint(_target(fit), (_argument(fit.records),), normal.sites)
+    with seeded(seed):
+        annealed = annealing.anneal(z, start, target, seed=seed)
+        values = MappingProxyType(dict(annealing.values_of(normal.sites, annealed.z)))
+    return PosteriorDraws(
+        values,
+        log_joint(fit, values),
+        None,
+        np.zeros(particles, dtype=int),
+        f"annealed from {kind}, whose own Pareto k is {k:.2f}",
+    )
 
 
 def log_joint(fit: Fit, values: Values) -> np.ndarray:
@@ -159,7 +185,11 @@ def _portion(model: Any, args: tuple[Any, ...], values: Values) -> np.ndarray:
                 *args
             )
             trace.compute_log_prob()
-    except (NotPositiveDefiniteError, torch.linalg.LinAlgError):
+    except (NotPositiveDefiniteError, torch.linalg.LinAlgError, ValueError) as error:
+        # Pyro wraps what a distribution raises in a ValueError.
+        singular = (NotPositiveDefiniteError, torch.linalg.LinAlgError)
+        if not isinstance(error, singular) and not isinstance(error.__cause__, singular):
+            raise
         if count == 1:  # this draw: the density cannot be evaluated there
             return np.array([-np.inf])
         each = [_portion(model, args, {k: v[i : i + 1] for k, v in values.items()}) for i in

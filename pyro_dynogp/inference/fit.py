@@ -196,7 +196,7 @@ def fit(
             progress=progress,
         )
         with seeded(seed):
-            sampled = _draws_of(found.guide, argument, draws or 200, best.values)
+            sampled = draws_of_guide(found.guide, argument, draws or 200, best.values)
         tail = found.elbo[-50:]
         common["mode"] = MappingProxyType(dict(found.mode))
         return Fit(
@@ -264,7 +264,8 @@ def _common(
     }
 
 
-def _draws_of(guide: Guide, args: Any, count: int, sites: Iterable[str]) -> dict[str, Tensor]:
+def draws_of_guide(guide: Guide, args: Any, count: int, sites: Iterable[str]) -> dict[str, Tensor]:
+    """Draws (count, *shape) of the sites named."""
     with torch.no_grad(), pyro.plate("draws", count, dim=-1):
         trace = pyro.poutine.trace(guide).get_trace(args)
     return {name: trace.nodes[name]["value"] for name in sites}

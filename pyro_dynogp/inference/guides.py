@@ -90,6 +90,10 @@ class GaussianGuide:
             )
         return values
 
+    def values_at(self, z: Tensor) -> dict[str, Tensor]:
+        """Constrained values (*s, *shape) of every site at unconstrained vectors z (*s, d)."""
+        return {site.name: site.transform(part) for site, part in parts(self.sites, z)}
+
     def log_prob(self, values: Mapping[str, Tensor]) -> Tensor:
         """Log-density (*s) of constrained values (*s, *shape) of all sites."""
         z, log_jacobian = [], torch.zeros((), dtype=torch.float64)

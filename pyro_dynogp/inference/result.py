@@ -266,6 +266,55 @@ class Fit:
 
         save(self, path)
 
+    def to_arviz(
+        self,
+        *,
+        future: Record | None = None,
+        samples: int = 200,
+        prior_samples: int = 200,
+        seed: int = 0,
+    ) -> Any:
+        """The fit as ArviZ's InferenceData, for `arviz` plots, tables and files.
+
+        Groups:
+
+        - posterior: every latent site (chain, draw, *shape), in scaled units; trajectories where
+          the guide had them; and in physical units decay rate, frequency and time constant of each
+          pole, gains of a linear model, scale of the measurement noise and offset of the outputs.
+          Chains are those of NUTS, else one; "map" has one draw.
+        - prior, prior_predictive: the same sites and quantities from the prior, outputs at them;
+          left out with ``priors="paper"``, whose draws exceed floating-point range.
+        - posterior_predictive: replicated outputs of the training record, jointly, from its inputs
+          alone, at draws spread evenly over all of them.
+        - predictions, predictions_constant_data: forecast of `future` after the last training
+          record, on its own clock.
+        - log_likelihood: one-step-ahead density of each output, trajectories integrated out [nats];
+          they add up to `log_likelihood`, NaN where an output is missing. Do not give them to
+          ``az.loo``: they are not independent given the draw. `pyro_dynogp.loo` is for that.
+        - sample_stats: ``lp``, log p(y, values) of each draw; of a variational posterior ``log_q``
+          and, in attrs, the Pareto shape of their ratios; what `diagnostics` holds, in attrs.
+        - observed_data ``y`` and constant_data: inputs ``u``, and ``elbo`` ("svi") or ``log_joint``
+          by step.
+
+        Several records give ``y_0``, ``y_1``, ... over ``time_0``, ``time_1``, ...; times are UTC
+        time stamps where the record has them. Units are in attrs of the variables and in the
+        labels ``input_unit`` and ``output_unit``.
+
+        Args:
+            future: a later record with inputs; its outputs are not used.
+            samples: number of replicates and of forecasts. prior_samples: of prior draws, 0 for
+                none. seed: for all of them.
+
+        Raises:
+            ValueError: on numbers that make no sense, a `future` that does not follow the last
+                training record or has other channels, and layers named as a dimension is.
+        """
+        from pyro_dynogp.criticism.inference_data import to_arviz
+
+        return to_arviz(
+            self, future=future, samples=samples, prior_samples=prior_samples, seed=seed
+        )
+
     def summary(self) -> str:
         """A few lines: what was fitted, how well it went, the modes at the best optimum."""
         from pyro_dynogp.inference.summary import summary

@@ -104,7 +104,9 @@ def test_incomplete_and_unknown_models_are_refused(tmp_path, map_fit):
 
 
 def test_training_records_come_back_with_names_units_and_clock(map_fit, record, tmp_path):
-    stamps = pd.date_range("2024-03-31 00:30", periods=len(record), freq="10min", tz="Europe/Berlin")
+    stamps = pd.date_range(
+        "2024-03-31 00:30", periods=len(record), freq="10min", tz="Europe/Berlin"
+    )
     full = dgp.Record(
         stamps,
         record.inputs,

@@ -1,0 +1,278 @@
+r"""Predictive densities of data that were left out, sample by sample: the three targets.
+
+Leaving sample i out turns the posterior into one proportional to
+p(theta | y) / p(y_i | y_-i, theta), so that draws theta_s of q get the ratios
+p(y, theta_s) / (q(theta_s) p(y_i | y_-i, theta_s)) (Magnusson, Andersen, Jonasson & Vehtari 2019;
+Buerkner, Gabry & Vehtari 2021 for outputs that are not independent). Forecasts leave out all of the
+future in the same way (Buerkner, Gabry & Vehtari 2020). Where Pareto's k says that ratios do not
+suffice, the model is fitted again.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.special import logsumexp
+from tqdm import tqdm
+
+from pyro_dynogp._errors import invalid
+from pyro_dynogp.criticism import arviz_bridge
+from pyro_dynogp.criticism.subjects import Subject
+from pyro_dynogp.parallel import parallel_map
+
+
+@dataclass(frozen=True, eq=False)
+class Base:
+    """Importance weights of the draws for the posterior of all data.
+
+    Attributes:
+        log_ratio: (S,) of posterior over proposal, zeros where uncorrected.
+        k: Pareto shape of the proposal; 0 for draws of the posterior itself.
+        corrected: whether the ratios are used.
+    """
+
+    log_ratio: np.ndarray
+    k: float
+    corrected: bool
+
+    @classmethod
+    def of(cls, subject: Subject) -> Base:
+        """Ratios, or none where the posterior's own k says that they are not to be trusted."""
+        ratio = subject.draws.log_ratio
+        k = float(arviz_bridge.psis(ratio)[1])
+        corrected = bool(k <= arviz_bridge.good_k(len(ratio)))
+        return cls(ratio if corrected else np.zeros_like(ratio), k, corrected)
+
+
+@dataclass
+class Found:
+    """What a target came to, sample by sample.
+
+    Attributes:
+        index: (N,) place of each scored sample among all measured ones.
+        elpd, k: (N,). lppd: with the posterior of all data. error: Monte Carlo standard error.
+        refits: how many. left: samples whose k is too high, not refitted.
+    """
+
+    index: np.ndarray
+    elpd: np.ndarray
+    k: np.ndarray
+    lppd: float
+    error: float
+    refits: int = 0
+    left: int = 0
+    notes: list[str] = field(default_factory=list)
+
+
+def mixture(log_weights: np.ndarray, log_density: np.ndarray) -> np.ndarray:
+    """Log of the weighted mean density: weights (N, S), densities (S, N) to (N,)."""
+    return logsumexp(log_weights + log_density.T, axis=-1)
+
+
+def monte_carlo_error(log_weights: np.ndarray, log_density: np.ndarray, elpd: np.ndarray) -> float:
+    """Standard error of the sum of `mixture` from its draws, by the delta method.
+
+    Each draw's influence is summed over samples first: all of them share the draws.
+    """
+    share = np.exp(log_weights + log_density.T - elpd[:, None]) - np.exp(log_weights)
+    return float(np.sqrt(np.square(share.sum(0)).sum()))
+
+
+def missing_sample(subject: Subject, most: int, workers: int | None, progress: bool) -> Found:
+    """Each sample given all others, by importance sampling; by refits where that does not do."""
+    density = subject.pointwise("missing sample")
+    base = Base.of(subject)
+    log_weights, k = arviz_bridge.psis(base.log_ratio - density.T)
+    elpd = mixture(log_weights, density)
+    whole = arviz_bridge.psis(base.log_ratio)[0]
+    lppd = float(mixture(np.broadcast_to(whole, log_weights.shape), density).sum())
+    error = monte_carlo_error(log_weights, density, elpd)
+    N = density.shape[1]
+    found = Found(np.arange(N), elpd, k, lppd, error)
+    _note(found, subject, base)
+    high = np.flatnonzero(k > arviz_bridge.good_k(len(whole)))
+    worst = high[np.argsort(-k[high])][:most]
+    found.left = len(high) - len(worst)
+    if len(worst):
+        again = parallel_map(
+            lambda i: _one_left_out(subject, int(i), N),
+            list(worst),
+            workers=workers,
+            progress=progress,
+            description="refits",
+        )
+        found.elpd[worst] = again
+        found.refits = len(worst)
+    return found
+
+
+def _one_left_out(subject: Subject, i: int, N: int) -> float:
+    other = subject.without(np.arange(N) == i)
+    density = other.pointwise("missing sample")[:, i]
+    weights = arviz_bridge.psis(Base.of(other).log_ratio)[0]
+    return float(logsumexp(weights + density))
+
+
+def forecast(
+    subject: Subject, horizon: int, begin: int | float, most: int, progress: bool
+) -> Found:
+    """Backwards through the record: ratios leave out ever more of the end, until a refit."""
+    places = subject.places
+    if len(np.unique(places["record"])) > 1:
+        raise invalid(
+            "record",
+            expected="one record for 'forecast'",
+            got=f"{len(np.unique(places['record']))}",
+            advice="Forecast each record by itself, or use target='new record'.",
+        )
+    sample = places["sample"]
+    first = _first_sample(begin, int(sample.max()) + 1)
+    scored = np.flatnonzero(sample >= first + horizon - 1)
+    if not len(scored) or first < 2:
+        raise invalid(
+            "begin", expected="samples before and after it", got=repr(begin),
+            advice="Give the number of samples that the first forecast may use.",
+        )  # fmt: skip
+    current = subject
+    step, target = _both(current, horizon)
+    base = Base.of(current)
+    log_ratio = base.log_ratio
+    good = arviz_bridge.good_k(len(log_ratio))
+    found = Found(scored, np.zeros(len(scored)), np.zeros(len(scored)), 0.0, 0.0)
+    _note(found, subject, base)
+    whole = arviz_bridge.psis(log_ratio)[0]
+    found.lppd = float(mixture(np.broadcast_to(whole, (len(scored), len(whole))),
+                               target[:, scored]).sum())  # fmt: skip
+    shares: list[np.ndarray] = []
+    end = len(sample)  # data before this one are in the current fit
+    bar = tqdm(total=len(scored), desc="forecasts", disable=not progress)
+    for place in range(len(scored) - 1, -1, -1):
+        i = int(scored[place])
+        # Outputs of one time follow one another at horizon 1; further ahead whole times do.
+        known = i if horizon == 1 else int(np.searchsorted(sample, sample[i] - horizon + 1))
+        log_weights, k = _given(log_ratio, step, known, end)
+        if k > good and found.refits < most:
+            current = subject.without(np.arange(len(sample)) >= known)
+            found.refits += 1
+            step, target = _both(current, horizon)
+            log_ratio, end = Base.of(current).log_ratio, known
+            log_weights, k = _given(log_ratio, step, known, end)
+        elif k > good:
+            found.left += 1
+        found.k[place] = k
+        found.elpd[place] = logsumexp(log_weights + target[:, i])
+        shares.append(np.exp(log_weights + target[:, i] - found.elpd[place]) - np.exp(log_weights))
+        bar.update()
+    bar.close()
+    found.error = float(np.sqrt(np.square(np.sum(shares, axis=0)).sum()))
+    return found
+
+
+def _both(subject: Subject, horizon: int) -> tuple[np.ndarray, np.ndarray]:
+    """One-step densities, which say what ratios are, and those of the target (S, N)."""
+    step = subject.pointwise("forecast", 1)
+    return step, step if horizon == 1 else subject.pointwise("forecast", horizon)
+
+
+def _given(
+    log_ratio: np.ndarray, step: np.ndarray, known: int, end: int
+) -> tuple[np.ndarray, float]:
+    """Weights (S,) for the posterior given the first `known` samples, and Pareto's k."""
+    log_weights, k = arviz_bridge.psis(log_ratio - step[:, known:end].sum(1))
+    return log_weights, float(k)
+
+
+def _first_sample(begin: int | float, n: int) -> int:
+    if isinstance(begin, float) and 0.0 < begin < 1.0:
+        return int(begin * n)
+    if isinstance(begin, int) and 2 <= begin < n:
+        return begin
+    raise invalid(
+        "begin", expected=f"a share between 0 and 1, or a number from 2 to {n - 1}", got=repr(begin)
+    )
+
+
+def new_record(subject: Subject, folds: int, workers: int | None, progress: bool) -> Found:
+    """Blocks, or whole records, as new experiments for a fit to the rest."""
+    blocks = _blocks(subject, folds)
+    results = parallel_map(
+        lambda block: _held_out(subject, block),
+        blocks,
+        workers=workers,
+        progress=progress,
+        description="folds",
+    )
+    order = np.concatenate([block[0] for block in blocks])
+    elpd = np.concatenate([one[0] for one in results])
+    k = np.concatenate([np.full(len(one[0]), one[1]) for one in results])
+    error = float(np.sqrt(sum(one[2] ** 2 for one in results)))
+    base = Base.of(subject)
+    weights = arviz_bridge.psis(base.log_ratio)[0]
+    lppd = sum(float(_chain(weights, subject.fresh(*block[1]))[0].sum()) for block in blocks)
+    found = Found(order, elpd, k, lppd, error, refits=len(blocks))
+    _note(found, subject, base)
+    found.left = int((k > arviz_bridge.good_k(len(weights))).sum())
+    return found
+
+
+Block = tuple[np.ndarray, tuple[int, int, int]]
+
+
+def _blocks(subject: Subject, folds: int) -> list[Block]:
+    """Samples of each block, and its record and range."""
+    places = subject.places
+    records = np.unique(places["record"])
+    found = []
+    if len(records) > 1:
+        for r in records:
+            own = np.flatnonzero(places["record"] == r)
+            found.append((own, (int(r), 0, int(places["sample"][own].max()) + 1)))
+        return found
+    n = int(places["sample"].max()) + 1
+    if not isinstance(folds, int) or not 2 <= folds <= n // 2:
+        raise invalid("folds", expected=f"a whole number from 2 to {n // 2}", got=repr(folds))
+    edges = np.linspace(0, n, folds + 1).astype(int)
+    for first, last in itertools.pairwise(edges):
+        own = np.flatnonzero((places["sample"] >= first) & (places["sample"] < last))
+        if len(own):
+            found.append((own, (0, int(first), int(last))))
+    return found
+
+
+def _held_out(subject: Subject, block: Block) -> tuple[np.ndarray, float, float]:
+    own, where = block
+    left_out = np.zeros(len(subject.places["sample"]), dtype=bool)
+    left_out[own] = True
+    other = subject.without(left_out)
+    base = Base.of(other)
+    log_weights = arviz_bridge.psis(base.log_ratio)[0]
+    elpd, error = _chain(log_weights, other.fresh(*where))
+    return elpd, base.k, error
+
+
+def _chain(log_weights: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, float]:
+    """Densities (N',) of samples one after the other, each given those before it in the block.
+
+    They add up to the log of the mean density of the whole block, and to its Monte Carlo error.
+    """
+    cumulated = log_weights[:, None] + np.cumsum(step, axis=1)
+    joint = logsumexp(cumulated, axis=0)
+    weight = np.exp(log_weights)
+    error = float(np.sqrt(np.square(np.exp(cumulated[:, -1] - joint[-1]) - weight).sum()))
+    return np.diff(joint, prepend=logsumexp(log_weights)), error
+
+
+def _note(found: Found, subject: Subject, base: Base) -> None:
+    if not base.corrected:
+        found.notes.append(
+            f"Pareto's k of the posterior itself is {base.k:.2f}: its draws are taken as they are, "
+            "without the ratios p/q."
+        )
+    if "at each optimum" in subject.draws.kind:
+        found.notes.append(
+            "Poles, gains, noise and lengthscales are at their optimum, which has seen the data: "
+            "fit with hyperparameters='multivariate normal' or method='nuts', or use "
+            "target='new record', to count what they cost."
+        )

@@ -1,0 +1,145 @@
+"""The model-selection hook: elpd of data that were left out, for the target that the user names."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from pyro_dynogp._errors import invalid
+from pyro_dynogp.criticism import arviz_bridge
+from pyro_dynogp.criticism.left_out import Base, Found, forecast, missing_sample, new_record
+from pyro_dynogp.criticism.subjects import FitSubject, Subject
+from pyro_dynogp.record import Record, as_records
+
+if TYPE_CHECKING:
+    from pyro_dynogp.inference.result import Fit
+
+Target = Literal["missing sample", "forecast", "new record"]
+TARGETS = ("missing sample", "forecast", "new record")
+# Refits that are made without being asked for more.
+MOST_REFITS = 30
+
+
+def loo(
+    fit: Fit | Subject,
+    record: Record | Sequence[Record] | None = None,
+    *,
+    target: Target,
+    horizon: int = 1,
+    begin: int | float = 0.5,
+    folds: int = 5,
+    draws: int = 1000,
+    refits: int = MOST_REFITS,
+    seed: int = 0,
+    workers: int | None = None,
+    progress: bool = True,
+) -> Any:
+    """Expected log predictive density of data that the model has not seen, as ArviZ's ELPDData.
+
+    There is no default target, since the answers differ: a smooth signal is far easier to fill in
+    than to forecast. Densities are those of outputs in their own units, with trajectories
+    integrated out.
+
+    Args:
+        fit: a fit, or another `Subject` (`dgp.from_pyro` makes one of any Pyro model).
+        record: the training record(s), by default those of the fit.
+        target: "missing sample", each output given all others, before and after (leave-one-out);
+            "forecast", each output given those at least `horizon` samples before
+            (leave-future-out); "new record", blocks of the record, or whole records where there
+            are several, as new experiments with unknown first state (K-fold).
+        horizon: of "forecast" [samples].
+        begin: of "forecast": first sample that is scored, a number of samples or a share of the
+            record.
+        folds: of "new record", contiguous blocks of a single record.
+        draws: of the posterior (of NUTS all).
+        refits: most fits that are made again where Pareto's k is above ArviZ's good_k
+            ("new record" makes one for each fold whatever this says).
+        seed: for the draws. workers: processes for refits. progress: whether to show a bar.
+
+    Returns:
+        ELPDData with ArviZ's entries (elpd_loo, se, p_loo, pareto_k, loo_i, ...) and: `target`,
+        `horizon`, `data` (fingerprint), `draws_from`, `posterior_k` (Pareto's k of the posterior
+        itself), `corrected` (whether ratios p/q enter: not where posterior_k is too high),
+        `monte_carlo_error` of elpd_loo [nats], `refits`, `not_refitted`, `notes`. `loo_i` has the
+        coordinates record, sample and output. `se` takes samples as independent: `compare` has
+        standard errors that do not.
+
+    Raises:
+        ValueError: on an unknown target, on a record that the fit was not trained on, on models
+            whose densities given other samples are not known.
+    """
+    if target not in TARGETS:
+        raise invalid(
+            "target",
+            expected=f"one of {list(TARGETS)}",
+            got=repr(target),
+            advice="Name what the model is for: filling gaps, forecasting, or new experiments.",
+        )
+    if not isinstance(refits, int) or refits < 0:
+        raise invalid("refits", expected="a whole number >= 0", got=repr(refits))
+    subject = subject_of(fit, record, draws, seed)
+    if target == "missing sample":
+        found = missing_sample(subject, refits, workers, progress)
+    elif target == "forecast":
+        found = forecast(subject, horizon, begin, refits, progress)
+    else:
+        found = new_record(subject, folds, workers, progress)
+    return _elpd(subject, found, target, horizon)
+
+
+def subject_of(
+    fit: Any, record: Record | Sequence[Record] | None, draws: int, seed: int
+) -> Subject:
+    """What `loo` works on."""
+    from pyro_dynogp.inference.result import Fit
+
+    if not isinstance(fit, Fit):
+        if not all(hasattr(fit, name) for name in ("draws", "pointwise", "places", "data")):
+            raise invalid("fit", expected="a Fit, or a Subject", got=type(fit).__name__)
+        return fit
+    if not fit.records:
+        raise invalid("fit", expected="a fit that knows its training records", got="none")
+    records = fit.records if record is None else as_records(record)
+    unknown = [one.name for one in records if one.fingerprint not in fit.training]
+    if unknown or len(records) != len(fit.records):
+        raise invalid(
+            "record",
+            expected="the training record(s), all of them",
+            got="others",
+            advice="Data that the fit has not seen are scored directly: dgp.scores, or "
+            "fit.log_likelihood.",
+        )
+    return FitSubject(fit, fit.records, draws, seed)
+
+
+def _elpd(subject: Subject, found: Found, target: str, horizon: int) -> Any:
+    base_k = float(arviz_bridge.psis(subject.draws.log_ratio)[1])
+    count = len(subject.draws)
+    if found.left:
+        found.notes.append(
+            f"{found.left} samples have a Pareto k above {arviz_bridge.good_k(count):.2f} and were "
+            "not fitted again: raise `refits`, or use target='new record'."
+        )
+    order = np.argsort(found.index)
+    return arviz_bridge.elpd_data(
+        found.elpd[order],
+        found.k[order],
+        lppd=found.lppd,
+        draws=count,
+        warning=bool(found.left or found.notes),
+        coords={name: value[found.index[order]] for name, value in subject.places.items()},
+        extra={
+            "target": target,
+            "horizon": horizon,
+            "data": subject.data,
+            "draws_from": subject.draws.kind,
+            "posterior_k": base_k,
+            "corrected": Base.of(subject).corrected,
+            "monte_carlo_error": found.error,
+            "refits": found.refits,
+            "not_refitted": found.left,
+            "notes": tuple(found.notes),
+        },
+    )

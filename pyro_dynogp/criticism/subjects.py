@@ -1,0 +1,207 @@
+"""What leaving data out needs of a fit: draws, densities of single samples, fits without them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import torch
+
+from pyro_dynogp._errors import invalid
+from pyro_dynogp.criticism.densities import Kind, pointwise_log_density
+from pyro_dynogp.criticism.posterior_draws import AT_ONCE, PosteriorDraws, at, draws_of
+from pyro_dynogp.inference.refit import refit
+from pyro_dynogp.models.cascade import Cascade
+from pyro_dynogp.models.collapsed import collapsed_of, outputs_with_gaps
+from pyro_dynogp.models.linear import LinearDynamicGP, initial_mean
+from pyro_dynogp.prediction.linear import prior_process
+from pyro_dynogp.record import Record
+
+if TYPE_CHECKING:
+    from pyro_dynogp.inference.result import Fit
+
+
+class Subject(Protocol):
+    """A model with its posterior and its N measured samples, in a fixed order."""
+
+    @property
+    def draws(self) -> PosteriorDraws:
+        """Draws (S) of the posterior."""
+
+    @property
+    def places(self) -> Mapping[str, np.ndarray]:
+        """Where each measured sample stands: "record", "sample", "output" (N,), all integer."""
+
+    @property
+    def data(self) -> str:
+        """Fingerprint of the data, gaps included."""
+
+    def pointwise(self, kind: Kind, horizon: int = 1) -> np.ndarray:
+        """Log-densities (S, N); see `criticism.densities`."""
+
+    def fresh(self, record: int, first: int, last: int) -> np.ndarray:
+        """One-step log-densities (S, N') of samples first to last - 1 as a record of its own."""
+
+    def without(self, left_out: np.ndarray) -> Subject:
+        """The same model fitted without some samples (N,), with densities of all of them."""
+
+
+@dataclass(frozen=True, eq=False)
+class FitSubject:
+    """A `Fit` along its training records.
+
+    Attributes:
+        fit: the fit; of `records`, or of less of them.
+        records: where densities are evaluated. count, seed: of the draws.
+    """
+
+    fit: Fit
+    records: tuple[Record, ...]
+    count: int
+    seed: int
+
+    @cached_property
+    def draws(self) -> PosteriorDraws:
+        """Draws (S) of the posterior."""
+        return draws_of(self.fit, count=self.count, seed=self.seed)
+
+    @cached_property
+    def places(self) -> Mapping[str, np.ndarray]:
+        """Where each measured sample stands (N,)."""
+        rows = [
+            np.column_stack([np.full(len(k), index), k])
+            for index, record in enumerate(self.records)
+            if len(k := np.argwhere(~record.missing))
+        ]
+        record, sample, output = np.concatenate(rows).T
+        return {"record": record, "sample": sample, "output": output}
+
+    @property
+    def data(self) -> str:
+        """Fingerprint of the data, gaps included."""
+        return "+".join(record.fingerprint for record in self.records)
+
+    def pointwise(self, kind: Kind, horizon: int = 1) -> np.ndarray:
+        """Log-densities (S, N)."""
+        parts = []
+        for index, record in enumerate(self.records):
+            found = self._each(
+                record, lambda part, i=index, r=record: observed_of(part, r, i), kind, horizon
+            )
+            parts.append(found[:, ~record.missing])
+        return np.concatenate(parts, axis=1)
+
+    def fresh(self, record: int, first: int, last: int) -> np.ndarray:
+        """One-step log-densities (S, N') of a stretch whose first state is unknown."""
+        own = self.records[record][first:last]
+        found = self._each(own, lambda part: observed_of(part, own, None), "forecast", 1)
+        return found[:, ~own.missing]
+
+    def _each(self, record: Record, observed: Any, kind: Kind, horizon: int) -> np.ndarray:
+        """Densities (S, n, n_y), as many draws at a time as memory allows."""
+        y = outputs_with_gaps(record)
+        portion = max(1, AT_ONCE // (len(record) * record.n_outputs))
+        parts = []
+        for first in range(0, len(self.draws), portion):
+            values = {k: v[first : first + portion] for k, v in self.draws.values.items()}
+            part = at(self.fit, replace(self.draws, values=values))
+            with torch.no_grad():
+                parts.append(pointwise_log_density(observed(part), y, kind, horizon=horizon))
+        return np.concatenate(parts)
+
+    def without(self, left_out: np.ndarray) -> FitSubject:
+        """The same model fitted without some samples (N,)."""
+        rest = []
+        for index, record in enumerate(self.records):
+            own = self.places["record"] == index
+            gone = own & left_out
+            y = record.outputs.copy()
+            y[self.places["sample"][gone], self.places["output"][gone]] = np.nan
+            if np.isnan(y).all():
+                raise invalid(
+                    "record",
+                    expected="samples left to fit to in each record",
+                    got=f"none in record {index}",
+                )
+            # What is measured before the first gap to the end is a shorter record.
+            end = int(np.flatnonzero(~np.isnan(y).all(1))[-1]) + 1
+            rest.append(record.with_outputs(y)[: max(end, 2)])
+        return replace(self, fit=refit(self.fit, rest))
+
+
+def observed_of(fit: Fit, record: Record, index: int | None) -> Any:
+    """Distribution of a record's outputs for each draw of a fit.
+
+    Args:
+        fit: the fit. record: along which.
+        index: of the training record whose first state the draws know; None where the first state
+            is unknown.
+    """
+    model, system = fit.model, fit.system
+    suffix = "" if len(fit.records) == 1 else f"_{index}"
+    if isinstance(model, Cascade):
+        states = {}
+        if index is not None:
+            names = {one.name: f"{one.name}_initial_state{suffix}" for one in model.state_sites}
+            states = {layer: fit.draws[site] for layer, site in names.items()}
+        return collapsed_of(model.begin(system, states), fit.scaling, record)
+    assert isinstance(model, LinearDynamicGP)
+    if model.initial_state == "site" and index is not None:
+        state = initial_mean(system.past_inputs, fit.draws[f"initial_state{suffix}"])
+        process = model.process(system, record, fit.scaling, state)
+    else:
+        process = prior_process(fit, record)
+    return process.observed(system.noise_sd)
+
+
+@dataclass(frozen=True, eq=False)
+class ArraySubject:
+    """Densities that a user has computed, for targets that need no refit.
+
+    Attributes:
+        draws: of the posterior. densities: (S, N) by kind.
+        places: (N,) arrays. data: fingerprint.
+    """
+
+    draws: PosteriorDraws
+    densities: Mapping[str, np.ndarray]
+    places: Mapping[str, np.ndarray]
+    data: str
+
+    def pointwise(self, kind: Kind, horizon: int = 1) -> np.ndarray:
+        """Log-densities (S, N)."""
+        if kind not in self.densities or horizon != 1:
+            raise invalid(
+                "target", expected=f"one with densities, {list(self.densities)}", got=repr(kind)
+            )
+        return self.densities[kind]
+
+    def fresh(self, record: int, first: int, last: int) -> np.ndarray:
+        """Not known."""
+        raise _no_refit()
+
+    def without(self, left_out: np.ndarray) -> Subject:
+        """Not known."""
+        raise _no_refit()
+
+
+def _no_refit() -> ValueError:
+    return invalid(
+        "target",
+        expected="one without refits for a model of your own",
+        got="one that fits again",
+        advice="Set refits=0 and look at Pareto's k, or fit to parts of the record yourself.",
+    )
+
+
+def fingerprint_of(outputs: Sequence[np.ndarray]) -> str:
+    """Hex SHA-256 of arrays of outputs."""
+    digest = hashlib.sha256()
+    for one in outputs:
+        plain = np.where(np.isnan(one), np.nan, one + 0.0).astype("<f8")
+        digest.update(repr(plain.shape).encode() + plain.tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,135 @@
+"""The same fit on other data of the same system: from its optima, with its scaling and priors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pyro_dynogp._errors import invalid
+from pyro_dynogp.inference.checkpoints import NOTHING_KEPT
+from pyro_dynogp.inference.fit import draws_of_guide
+from pyro_dynogp.inference.guides import GaussianGuide, MixtureGuide
+from pyro_dynogp.inference.maximum import Optimum, maximise
+from pyro_dynogp.inference.posterior import Hyperparameters, posterior_of
+from pyro_dynogp.inference.result import Fit
+from pyro_dynogp.inference.sampling import sample_posterior
+from pyro_dynogp.models.cascade import Cascade
+from pyro_dynogp.parallel import seeded
+from pyro_dynogp.record import Record
+
+# Iterations from the old optimum: of L-BFGS, of Adam, of SVI for all sites.
+LINEAR_STEPS, CASCADE_STEPS, SVI_STEPS = 300, 200, 400
+# Of NUTS, whose chains start at the mode.
+WARMUP = 300
+
+
+def refit(fit: Fit, records: Record | Sequence[Record]) -> Fit:
+    """Fit again by the same method, beginning at the optima of the old fit, in this process.
+
+    The scaling, and with it every prior, stays that of the old fit: what changes is the data alone.
+
+    Args:
+        fit: the old fit. records: as many as it has, each with the same channels.
+
+    Raises:
+        ValueError: on a fit with trajectories as sites, whose guide belongs to its record, or on
+            another number of records.
+    """
+    several = (records,) if isinstance(records, Record) else tuple(records)
+    if not fit.collapsed:
+        raise invalid(
+            "fit",
+            expected="a fit whose trajectories are integrated out",
+            got="one with trajectories as sites, whose guide belongs to its record",
+            advice="Fit with guide='collapsed', or do without refits.",
+        )
+    if len(several) != len(fit.records):
+        raise invalid("records", expected=f"{len(fit.records)}, as before", got=str(len(several)))
+    target: Any = fit.model.collapsed if isinstance(fit.model, Cascade) else fit.model
+    argument = several[0] if len(several) == 1 else several
+    cascade = isinstance(fit.model, Cascade)
+    optima = maximise(
+        target,
+        argument,
+        [dict(values) for values in optima_of(fit)],
+        optimizer="adam" if cascade else "lbfgs",
+        steps=CASCADE_STEPS if cascade else LINEAR_STEPS,
+        seed=fit.seed,
+        workers=1,
+        kept=1.0,
+    )
+    best = optima[0]
+    changed: dict[str, Any] = {
+        "mode": MappingProxyType(best.values),
+        "history": best.history,
+        "records": several,
+        "trajectories": {},
+    }
+    if fit.method == "map":
+        draws = {name: value.unsqueeze(0) for name, value in best.values.items()}
+        return replace(fit, draws=MappingProxyType(draws), **changed)
+    if fit.method == "nuts":
+        draws = _sampled(fit, target, argument, best)
+        return replace(fit, draws=MappingProxyType(draws), **changed)
+    found = posterior_of(
+        target,
+        argument,
+        optima,
+        _family(fit),
+        steps=60 if isinstance(fit.posterior, MixtureGuide) else SVI_STEPS,
+        particles=8,
+        learning_rate=0.02,
+        seed=fit.seed,
+        workers=1,
+        checkpoints=NOTHING_KEPT,
+        progress=False,
+    )
+    changed |= {"mode": MappingProxyType(dict(found.mode)), "history": found.elbo}
+    count = len(next(iter(fit.draws.values())))
+    with seeded(fit.seed):
+        draws = draws_of_guide(found.guide, argument, count, best.values)
+    return replace(fit, draws=MappingProxyType(draws), posterior=found.guide, **changed)
+
+
+def optima_of(fit: Fit) -> list[Mapping[str, Tensor]]:
+    """Values of all sites at each optimum that a fit consists of, the leading one first."""
+    posterior = fit.posterior
+    if not isinstance(posterior, MixtureGuide):
+        return [fit.mode]
+    found: list[Mapping[str, Tensor]] = []
+    for k in range(len(posterior.weights)):
+        centre = GaussianGuide(posterior.loc[k], posterior.scale_tril[k], posterior.sites)
+        points = {name: x[k] for name, x in posterior.points.items()}
+        found.append({**points, **centre.values_at(posterior.loc[k])})
+    return found
+
+
+def _family(fit: Fit) -> Hyperparameters:
+    """What `fit` was told about hyperparameters."""
+    if isinstance(fit.posterior, MixtureGuide):
+        return "map"
+    assert isinstance(fit.posterior, GaussianGuide)
+    root = fit.posterior.scale_tril
+    independent = torch.equal(root, torch.diag(root.diagonal()))
+    return "normal" if independent else "multivariate normal"
+
+
+def _sampled(fit: Fit, target: Any, argument: Any, best: Optimum) -> dict[str, Tensor]:
+    chains = int(fit.diagnostics["chains"])
+    found = sample_posterior(
+        target,
+        argument,
+        best.values,
+        chains=chains,
+        draws=len(next(iter(fit.draws.values()))) // chains,
+        warmup=WARMUP,
+        seed=fit.seed,
+        workers=1,
+        progress=False,
+    )
+    return {name: value.flatten(0, 1) for name, value in found.draws.items()}
