@@ -7,6 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pyro_dynogp import datasets, plotting
+    from pyro_dynogp.criticism.calibration import Calibration, calibration
+    from pyro_dynogp.criticism.check import Check, check
+    from pyro_dynogp.criticism.comparison import Comparison, Stack, compare, stack
+    from pyro_dynogp.criticism.from_pyro import from_pyro
+    from pyro_dynogp.criticism.loo import loo
+    from pyro_dynogp.criticism.predictive_checks import PredictiveChecks, predictive_checks
+    from pyro_dynogp.criticism.pyro_posterior import PyroPosterior
     from pyro_dynogp.distributions.conditioned import ConditionedLTIProcess
     from pyro_dynogp.distributions.decay import LogDecayRate
     from pyro_dynogp.distributions.inducing import InducingLTIProcess, inducing_times
@@ -51,8 +58,11 @@ __version__ = "0.1.0"
 
 # Names are imported when they are first used (PEP 562), so that the command line answers at once.
 _HOME = {
+    "Calibration": "pyro_dynogp.criticism.calibration",
     "Cascade": "pyro_dynogp.models.cascade",
     "CascadeSystem": "pyro_dynogp.models.cascade",
+    "Check": "pyro_dynogp.criticism.check",
+    "Comparison": "pyro_dynogp.criticism.comparison",
     "ConditionedLTIProcess": "pyro_dynogp.distributions.conditioned",
     "Dynamic": "pyro_dynogp.models.layers",
     "Family": "pyro_dynogp.guides.families",
@@ -70,10 +80,10 @@ _HOME = {
     "LTIMean": "pyro_dynogp.gp",
     "LTIParameters": "pyro_dynogp.gp",
     "LTIProcess": "pyro_dynogp.distributions.process",
-    "LogDecayRate": "pyro_dynogp.distributions.decay",
     "LayerGuide": "pyro_dynogp.guides.layer_guide",
     "Likelihood": "pyro_dynogp.layers.noise",
     "LinearDynamicGP": "pyro_dynogp.models.linear",
+    "LogDecayRate": "pyro_dynogp.distributions.decay",
     "MeanField": "pyro_dynogp.guides.families",
     "ModalState": "pyro_dynogp.lti.state",
     "Modes": "pyro_dynogp.lti.modes",
@@ -81,9 +91,12 @@ _HOME = {
     "ObservedLTIProcess": "pyro_dynogp.distributions.process",
     "Point": "pyro_dynogp.guides.families",
     "Prediction": "pyro_dynogp.prediction.prediction",
+    "PredictiveChecks": "pyro_dynogp.criticism.predictive_checks",
+    "PyroPosterior": "pyro_dynogp.criticism.pyro_posterior",
     "Record": "pyro_dynogp.record",
     "SameAsPrior": "pyro_dynogp.guides.families",
     "Scaling": "pyro_dynogp.scaling",
+    "Stack": "pyro_dynogp.criticism.comparison",
     "Static": "pyro_dynogp.models.layers",
     "StaticFunction": "pyro_dynogp.layers.static",
     "StudentT": "pyro_dynogp.layers.noise",
@@ -91,19 +104,29 @@ _HOME = {
     "TrainingDivergedError": "pyro_dynogp.inference.svi",
     "Wiener": "pyro_dynogp.models.architectures",
     "WienerHammerstein": "pyro_dynogp.models.architectures",
+    "calibration": "pyro_dynogp.criticism.calibration",
+    "check": "pyro_dynogp.criticism.check",
+    "compare": "pyro_dynogp.criticism.comparison",
     "fit": "pyro_dynogp.inference.fit",
+    "from_pyro": "pyro_dynogp.criticism.from_pyro",
     "inducing_times": "pyro_dynogp.distributions.inducing",
     "load": "pyro_dynogp.inference.storage",
+    "loo": "pyro_dynogp.criticism.loo",
+    "predictive_checks": "pyro_dynogp.criticism.predictive_checks",
     "sample_modes": "pyro_dynogp.models.priors",
     "sample_static": "pyro_dynogp.layers.static",
     "scores": "pyro_dynogp.prediction.scores",
+    "stack": "pyro_dynogp.criticism.comparison",
     "static_gp": "pyro_dynogp.layers.static",
 }
 _MODULES = ("datasets", "plotting")
 
 __all__ = [
+    "Calibration",
     "Cascade",
     "CascadeSystem",
+    "Check",
+    "Comparison",
     "ConditionedLTIProcess",
     "Dynamic",
     "Family",
@@ -132,9 +155,12 @@ __all__ = [
     "ObservedLTIProcess",
     "Point",
     "Prediction",
+    "PredictiveChecks",
+    "PyroPosterior",
     "Record",
     "SameAsPrior",
     "Scaling",
+    "Stack",
     "Static",
     "StaticFunction",
     "StudentT",
@@ -142,14 +168,21 @@ __all__ = [
     "TrainingDivergedError",
     "Wiener",
     "WienerHammerstein",
+    "calibration",
+    "check",
+    "compare",
     "datasets",
     "fit",
+    "from_pyro",
     "inducing_times",
     "load",
+    "loo",
     "plotting",
+    "predictive_checks",
     "sample_modes",
     "sample_static",
     "scores",
+    "stack",
     "static_gp",
 ]
 

@@ -75,7 +75,7 @@ class PosteriorDraws:
         return out
 
 
-def draws_of(fit: Fit, *, count: int = 400, seed: int = 0) -> PosteriorDraws:
+def draws_of(fit: Fit, *, count: int = 400, seed: int = 0, anneal: bool = True) -> PosteriorDraws:
     """Draws of all parameters of a fit.
 
     NUTS: its draws. A variational posterior: fresh draws of it; of a cascade by default those of
@@ -86,6 +86,7 @@ def draws_of(fit: Fit, *, count: int = 400, seed: int = 0) -> PosteriorDraws:
 
     Args:
         fit: the fit. count: number of draws S (of NUTS all there are). seed: for them.
+        anneal: whether particles are annealed; False for the draws of the fit's own normal.
     """
     if fit.method == "nuts":
         n = len(next(iter(fit.draws.values())))
@@ -101,11 +102,11 @@ def draws_of(fit: Fit, *, count: int = 400, seed: int = 0) -> PosteriorDraws:
             "SVI with trajectories as sites",
         )
     if isinstance(fit.posterior, GaussianGuide):
-        return _of_normal(fit, fit.posterior, count, seed, "SVI, multivariate normal")
+        return _of_normal(fit, fit.posterior, count, seed, "SVI, multivariate normal", anneal)
     if isinstance(fit.posterior, MixtureGuide):
         return _of_optima(fit, fit.posterior, count, seed)
     normal = laplace(fit, fit.mode)
-    return _of_normal(fit, normal, count, seed, "Laplace's approximation")
+    return _of_normal(fit, normal, count, seed, "Laplace's approximation", anneal)
 
 
 def _of_optima(fit: Fit, guide: MixtureGuide, count: int, seed: int) -> PosteriorDraws:
@@ -129,7 +130,9 @@ def laplace(fit: Fit, values: Values) -> GaussianGuide:
     return gaussian_guide(potential, torch.as_tensor(centre), torch.as_tensor(root))
 
 
-def _of_normal(fit: Fit, normal: GaussianGuide, count: int, seed: int, kind: str) -> PosteriorDraws:
+def _of_normal(
+    fit: Fit, normal: GaussianGuide, count: int, seed: int, kind: str, anneal: bool
+) -> PosteriorDraws:
     """Draws of a normal, or of the posterior where a normal will not do."""
     with seeded(seed), torch.no_grad():
         noise = torch.randn(count, len(normal.loc), dtype=torch.float64)
@@ -139,7 +142,7 @@ def _of_normal(fit: Fit, normal: GaussianGuide, count: int, seed: int, kind: str
     drawn = PosteriorDraws(values, log_joint(fit, values), log_q, single, kind)
     k = float(arviz_bridge.psis(drawn.log_ratio)[1])
     # A cascade costs too much for that: its draws are left as they are, and k says so.
-    if k <= arviz_bridge.good_k(count) or isinstance(fit.model, Cascade):
+    if not anneal or k <= arviz_bridge.good_k(count) or isinstance(fit.model, Cascade):
         return drawn
     particles = min(count, PARTICLES)
     z, start = annealing.around(normal, particles, seed)

@@ -121,15 +121,11 @@ class FitSubject:
             gone = own & left_out
             y = record.outputs.copy()
             y[self.places["sample"][gone], self.places["output"][gone]] = np.nan
-            if np.isnan(y).all():
-                raise invalid(
-                    "record",
-                    expected="samples left to fit to in each record",
-                    got=f"none in record {index}",
-                )
             # What is measured before the first gap to the end is a shorter record.
-            end = int(np.flatnonzero(~np.isnan(y).all(1))[-1]) + 1
-            rest.append(record.with_outputs(y)[: max(end, 2)])
+            there = np.flatnonzero(~np.isnan(y).all(1))
+            rest.append(record.with_outputs(y)[: max(there[-1] + 1 if len(there) else 0, 2)])
+        if all(one.missing.all() for one in rest):
+            raise invalid("record", expected="samples left to fit to", got="none")
         return replace(self, fit=refit(self.fit, rest))
 
 

@@ -18,8 +18,8 @@ from pyro_dynogp._errors import invalid
 class Prediction:
     """Predictive distribution of measured outputs, in the units of the record.
 
-    Given the parameters the outputs are Gaussian; over S posterior draws they are an equal-weight
-    mixture, whose moments, quantiles and densities here are exact.
+    Given the parameters the outputs are Gaussian; over S posterior draws they are a mixture, of
+    equal weights unless stated, whose moments, quantiles and densities here are exact.
 
     Attributes:
         time: (n,) in the unit of the record.
@@ -31,6 +31,7 @@ class Prediction:
         parts: share of the variance (n, n_y) by cause; they add up to the variance.
         sampler: draws joint samples (S', n, n_y); called once.
         kind: what was predicted, in words.
+        weights: (S,) of the draws; None for equal ones.
     """
 
     time: np.ndarray
@@ -41,16 +42,28 @@ class Prediction:
     parts: Mapping[str, np.ndarray]
     sampler: Callable[[], np.ndarray]
     kind: str
+    weights: np.ndarray | None = None
+
+    @property
+    def component_weights(self) -> np.ndarray:
+        """(S,): they add up to one."""
+        count = len(self.component_mean)
+        return np.full(count, 1.0 / count) if self.weights is None else self.weights
+
+    def _average(self, x: np.ndarray) -> np.ndarray:
+        """Weighted mean over the draws, the first dimension."""
+        # The plain mean where weights are equal: other sums round differently.
+        return x.mean(0) if self.weights is None else np.tensordot(self.weights, x, 1)
 
     @cached_property
     def mean(self) -> np.ndarray:
         """(n, n_y)."""
-        return self.component_mean.mean(0)
+        return self._average(self.component_mean)
 
     @cached_property
     def variance(self) -> np.ndarray:
         """(n, n_y): of measured outputs, measurement noise included."""
-        return self.signal_variance + self.noise_variance.mean(0)
+        return self.signal_variance + self._average(self.noise_variance)
 
     @property
     def sd(self) -> np.ndarray:
@@ -60,7 +73,8 @@ class Prediction:
     @property
     def signal_variance(self) -> np.ndarray:
         """(n, n_y): of the noise-free outputs."""
-        return self.component_variance.mean(0) + self.component_mean.var(0)
+        spread = self._average((self.component_mean - self.mean) ** 2)
+        return self._average(self.component_variance) + spread
 
     @property
     def signal_sd(self) -> np.ndarray:
@@ -101,7 +115,7 @@ class Prediction:
             return low
         for _ in range(60):
             middle = 0.5 * (low + high)
-            below = ndtr((middle - mean) / sd).mean(0) < level
+            below = self._average(ndtr((middle - mean) / sd)) < level
             low, high = np.where(below, middle, low), np.where(below, high, middle)
         return 0.5 * (low + high)
 
@@ -109,11 +123,11 @@ class Prediction:
         """Log-density (n, n_y) of each measured output by itself; NaN where it is missing."""
         z = (outputs - self.component_mean) / self.component_sd
         terms = -0.5 * z**2 - np.log(self.component_sd) - 0.5 * np.log(2.0 * np.pi)
-        return logsumexp(terms, axis=0) - np.log(len(terms))
+        return logsumexp(terms + np.log(self.component_weights)[:, None, None], axis=0)
 
     def probability_integral(self, outputs: np.ndarray) -> np.ndarray:
         """Predictive distribution function (n, n_y) at the measured outputs."""
-        return ndtr((outputs - self.component_mean) / self.component_sd).mean(0)
+        return self._average(ndtr((outputs - self.component_mean) / self.component_sd))
 
     def to_frame(self) -> pd.DataFrame:
         """Table of mean, sd and the 95 % interval of every output, indexed by time."""

@@ -98,8 +98,14 @@ def _crps(prediction: Prediction, there: np.ndarray, a: int, y: np.ndarray) -> f
         return float(np.mean(scoringrules.crps_normal(y, mean[0], sd[0])))
     # The mixture's score is quadratic in the number of draws: blocks bound the memory.
     block = max(1, int(2e7 / len(mean) ** 2))
+    weights = prediction.weights
     parts = [
-        scoringrules.crps_mixnorm(y[k], mean[:, k].T, sd[:, k].T)
+        scoringrules.crps_mixnorm(
+            y[k],
+            mean[:, k].T,
+            sd[:, k].T,
+            None if weights is None else np.broadcast_to(weights, mean[:, k].T.shape),
+        )
         for k in (slice(i, i + block) for i in range(0, len(y), block))
     ]
     return float(np.mean(np.concatenate([np.atleast_1d(part) for part in parts])))

@@ -1,0 +1,206 @@
+"""Whether a posterior is to be trusted, on one screen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pyro
+import torch
+
+from pyro_dynogp._errors import invalid
+from pyro_dynogp.criticism import arviz_bridge
+from pyro_dynogp.criticism.calibration import calibration
+from pyro_dynogp.criticism.posterior_draws import PosteriorDraws, draws_of, log_joint_of
+
+if TYPE_CHECKING:
+    from pyro_dynogp.inference.result import Fit
+
+# Largest R-hat and fewest effective draws of chains that have mixed (Vehtari et al. 2021).
+R_HAT, EFFECTIVE = 1.01, 400
+# An optimum is found again where another start comes this close [nats].
+SAME = 2.0
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at.
+
+    Attributes:
+        name: what. value: its number, NaN where there is none. good: None where it only informs.
+        text: what it says, in words.
+    """
+
+    name: str
+    value: float
+    good: bool | None
+    text: str
+
+
+@dataclass(frozen=True)
+class Check:
+    """What `check` found.
+
+    Attributes:
+        findings: in order. method: of the fit.
+    """
+
+    findings: tuple[Finding, ...]
+    method: str
+
+    @property
+    def good(self) -> bool:
+        """Whether nothing speaks against the fit."""
+        return all(one.good is not False for one in self.findings)
+
+    @property
+    def verdict(self) -> str:
+        """One sentence."""
+        bad = [one.name for one in self.findings if one.good is False]
+        if not bad:
+            return "Nothing that was looked at speaks against this fit."
+        return f"Look again at: {', '.join(bad)}."
+
+    def __getitem__(self, name: str) -> Finding:
+        for one in self.findings:
+            if one.name == name:
+                return one
+        raise KeyError(name)
+
+    def __str__(self) -> str:
+        mark = {True: "good", False: "BAD", None: ""}
+        width = max(len(one.name) for one in self.findings)
+        lines = [
+            f"{one.name:<{width}}  {mark[one.good]:<4}  "
+            f"{'' if np.isnan(one.value) else format(one.value, '.3g'):>8}  {one.text}"
+            for one in self.findings
+        ]
+        return "\n".join([f"Check of a fit by {self.method}", *lines, self.verdict])
+
+
+def check(fit: Fit, *, draws: int = 1000, seed: int = 0) -> Check:
+    """Check the posterior of a fit and its one-step predictions of the training record.
+
+    - Pareto's k of the posterior (Yao, Vehtari, Simpson & Gelman 2018), with trajectories
+      integrated out: below 0.5 the approximation is close to the posterior, up to good_k it can
+      be corrected by importance weights, above it is another distribution. For "map" it is that of
+      Laplace's approximation: whether the posterior is near a normal at all. Where trajectories are
+      sites also that of the whole vector, high in many dimensions even where margins are good.
+    - NUTS: R-hat, effective draws, divergences.
+    - ELBO: whether it still rose at the end. Starts: whether another one came to the same optimum.
+    - One-step predictions: calibrated on the training record (see `calibration`).
+
+    Args:
+        fit: the fit. draws: for Pareto's k. seed: for them.
+
+    Raises:
+        ValueError: where the fit does not know its training records.
+    """
+    if not fit.records:
+        raise invalid("fit", expected="a fit that knows its training records", got="none")
+    findings: list[Finding] = []
+    if fit.method == "nuts":
+        findings += _chains(fit)
+    else:
+        findings.append(_posterior(fit, draws, seed))
+    if fit.log_q_sites and fit.trajectories:
+        findings.append(_whole_vector(fit))
+    if fit.method == "svi":
+        findings.append(_elbo(fit))
+    findings.append(_starts(fit))
+    findings += _predictions(fit)
+    return Check(tuple(findings), fit.method)
+
+
+def _posterior(fit: Fit, draws: int, seed: int) -> Finding:
+    own = draws_of(fit, count=draws, seed=seed, anneal=False)
+    k = float(arviz_bridge.psis(own.log_ratio)[1])
+    good = arviz_bridge.good_k(len(own))
+    whose = own.kind
+    if not np.isfinite(k) or k > good:
+        text = (
+            f"{whose}: not the posterior's shape (good: below {good:.2f}); do not read parameters' "
+            "bands off it, compare with method='nuts'"
+        )
+        return Finding("posterior k", k, False, text)
+    if k > 0.5:
+        return Finding("posterior k", k, True, f"{whose}: usable with importance weights")
+    return Finding("posterior k", k, True, f"{whose}: close to the posterior")
+
+
+def _whole_vector(fit: Fit) -> Finding:
+    """Trajectories as sites: the ratio of all that the guide draws."""
+    values = {**fit.draws, **fit.trajectories}
+    argument = fit.records[0] if len(fit.records) == 1 else fit.records
+    samples = sum(len(record) for record in fit.records)
+    with torch.no_grad(), pyro.poutine.block():
+        log_p = log_joint_of(fit.model, (argument,), values, samples)
+    log_q = torch.stack(list(fit.log_q_sites.values())).sum(0).numpy()
+    ratio = PosteriorDraws(values, log_p, log_q, np.zeros(len(log_q), dtype=int), "").log_ratio
+    k = float(arviz_bridge.psis(ratio)[1])
+    text = "all sites together, trajectories too: informs, high in many dimensions"
+    return Finding("whole-vector k", k, None, text)
+
+
+def _chains(fit: Fit) -> list[Finding]:
+    r_hat = {k: v for k, v in fit.diagnostics.items() if k.startswith("r_hat ")}
+    ess = {k: v for k, v in fit.diagnostics.items() if k.startswith("effective samples ")}
+    worst = max(r_hat, key=lambda name: r_hat[name])
+    fewest = min(ess, key=lambda name: ess[name])
+    divergences = fit.diagnostics["divergences"]
+    share = divergences / max(1, len(next(iter(fit.draws.values()))))
+    return [
+        Finding(
+            "R-hat", r_hat[worst], r_hat[worst] < R_HAT,
+            f"largest, of {worst.removeprefix('r_hat ')} (good: below {R_HAT}); pairs that can be "
+            "swapped raise it without harm to predictions",
+        ),
+        Finding(
+            "effective draws", ess[fewest], ess[fewest] >= EFFECTIVE,
+            f"fewest, of {fewest.removeprefix('effective samples ')} (good: {EFFECTIVE} and more)",
+        ),
+        Finding(
+            "divergences", divergences, share <= 0.001,
+            "transitions that lost the trajectory (good: none)",
+        ),
+    ]  # fmt: skip
+
+
+def _elbo(fit: Fit) -> Finding:
+    """Whether the last fifth of the steps lies above the fifth before it, beyond its noise."""
+    history = np.asarray(fit.history)
+    fifth = max(len(history) // 5, 2)
+    last, before = history[-fifth:], history[-2 * fifth : -fifth]
+    if len(before) < 2:
+        return Finding("ELBO", float(last.mean()), None, "too few steps to tell")
+    rise = float(last.mean() - before.mean())
+    error = float(np.sqrt(last.var() / len(last) + before.var() / len(before)))
+    still = rise > max(1.0, 3.0 * error)
+    text = f"rose by {rise:.2f} nats ({error:.2f}) in the last fifth of {len(history)} steps"
+    if still:
+        text += ": not at its end, raise steps"
+    return Finding("ELBO", float(last.mean()), not still, text)
+
+
+def _starts(fit: Fit) -> Finding:
+    energies = np.asarray(fit.start_energies)
+    count = int((energies - energies.min() < SAME).sum())
+    if len(energies) == 1:
+        return Finding("starts", 1.0, None, "one start: others may lead to better optima")
+    text = f"of {len(energies)} came within {SAME:g} nats of the best"
+    if count == 1:
+        text += ": raise restarts, or look at what another seed gives"
+    return Finding("starts", float(count), None, text)
+
+
+def _predictions(fit: Fit) -> list[Finding]:
+    findings = []
+    for index, record in enumerate(fit.records):
+        found = calibration(fit.predict(record), record)
+        suffix = f" of record {index}" if len(fit.records) > 1 else ""
+        p = float(np.min(found.p_value))
+        findings.append(
+            Finding(f"one-step calibration{suffix}", p, bool(found.calibrated), found.verdict)
+        )
+    return findings

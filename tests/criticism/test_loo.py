@@ -1,0 +1,241 @@
+"""The hook: importance sampling against refits and known answers, targets, units, refusals."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.special import logsumexp
+from scipy.stats import norm
+
+import pyro_dynogp as dgp
+from pyro_dynogp.criticism import arviz_bridge
+from pyro_dynogp.criticism.densities import pointwise_log_density
+from pyro_dynogp.criticism.left_out import monte_carlo_error
+from pyro_dynogp.criticism.posterior_draws import PosteriorDraws, draws_of
+from pyro_dynogp.criticism.subjects import ArraySubject, FitSubject, fingerprint_of
+from tests.conftest import simulate_record
+
+QUIET = {"workers": 1, "progress": False}
+
+
+@pytest.fixture(scope="module")
+def short(one_pair):
+    return simulate_record(one_pair, 0.1, n=60, seed=2)
+
+
+@pytest.fixture(scope="module")
+def linear(short):
+    return dgp.fit(dgp.LinearDynamicGP(inputs=1, pairs=1), short, restarts=2, **QUIET)
+
+
+@pytest.fixture(scope="module")
+def left_out(linear):
+    return dgp.loo(linear, target="missing sample", draws=250, **QUIET)
+
+
+class NormalMean:
+    """y_i ~ N(mu, 1), mu ~ N(0, 10^2): everything is known."""
+
+    def __init__(self, n=40, S=3000, wide=1.0, seed=0):
+        rng = np.random.default_rng(seed)
+        self.y = rng.standard_normal(n) + 0.7
+        self.variance = 1.0 / (n + 0.01)
+        self.mean = self.variance * self.y.sum()
+        sd = np.sqrt(self.variance) * wide
+        mu = self.mean + sd * rng.standard_normal(S)
+        density = norm.logpdf(self.y, mu[:, None], 1.0)
+        draws = PosteriorDraws(
+            {"mu": torch.tensor(mu)},
+            density.sum(1) + norm.logpdf(mu, 0.0, 10.0),
+            norm.logpdf(mu, self.mean, sd),
+            np.zeros(S, dtype=int),
+            "test",
+        )
+        places = {"record": np.zeros(n, int), "sample": np.arange(n), "output": np.zeros(n, int)}
+        kinds = {"missing sample": density, "forecast": density}
+        self.subject = ArraySubject(draws, kinds, places, fingerprint_of([self.y]))
+
+    def exact(self, kept):
+        variance = 1.0 / (kept.sum() + 0.01)
+        return variance * self.y[kept].sum(), variance
+
+    def missing_sample(self):
+        n = len(self.y)
+        found = []
+        for i in range(n):
+            mean, variance = self.exact(np.arange(n) != i)
+            found.append(norm.logpdf(self.y[i], mean, np.sqrt(1.0 + variance)))
+        return np.array(found)
+
+    def forecast(self, first):
+        n = len(self.y)
+        found = []
+        for i in range(first, n):
+            mean, variance = self.exact(np.arange(n) < i)
+            found.append(norm.logpdf(self.y[i], mean, np.sqrt(1.0 + variance)))
+        return np.array(found)
+
+
+@pytest.mark.parametrize("wide", [1.0, 1.3])
+def test_importance_sampling_against_the_conjugate_answer(wide):
+    """From a proposal wider than the posterior too: the ratios p/q correct it."""
+    case = NormalMean(wide=wide)
+    found = dgp.loo(case.subject, target="missing sample", **QUIET)
+    exact = case.missing_sample()
+    assert found.elpd_loo == pytest.approx(exact.sum(), abs=4 * found["monte_carlo_error"])
+    np.testing.assert_allclose(found.loo_i.values, exact, atol=0.02)
+    assert found["corrected"]
+    assert (found.pareto_k.values < 0.5).all()
+    assert found["refits"] == 0
+
+
+def test_without_the_ratios_a_wide_proposal_is_wrong():
+    case = NormalMean(wide=2.5)
+    right = dgp.loo(case.subject, target="missing sample", **QUIET)
+    plain = replace(case.subject, draws=replace(case.subject.draws, log_q=None))
+    wrong = dgp.loo(plain, target="missing sample", **QUIET)
+    exact = case.missing_sample().sum()
+    assert abs(right.elpd_loo - exact) < 0.1 < abs(wrong.elpd_loo - exact)
+
+
+def test_forecasts_against_the_conjugate_answer():
+    case = NormalMean(n=60, S=6000)
+    found = dgp.loo(case.subject, target="forecast", begin=40, refits=0, **QUIET)
+    exact = case.forecast(40)
+    assert found.n_data_points == 20
+    assert found.elpd_loo == pytest.approx(exact.sum(), abs=4 * found["monte_carlo_error"] + 0.02)
+    assert list(found.loo_i["sample"].values) == list(range(40, 60))
+
+
+def test_monte_carlo_error_is_the_spread_over_repetitions():
+    totals, errors = [], []
+    for seed in range(60):
+        rng = np.random.default_rng([seed, 9])
+        y = np.linspace(-1, 1, 20)
+        mu = 0.3 * rng.standard_normal(200)
+        density = norm.logpdf(y, mu[:, None], 1.0)
+        log_weights = np.full((20, 200), -np.log(200.0))
+        elpd = logsumexp(log_weights + density.T, axis=1)
+        totals.append(elpd.sum())
+        errors.append(monte_carlo_error(log_weights, density, elpd))
+    assert np.mean(errors) == pytest.approx(np.std(totals), rel=0.25)
+
+
+def test_exact_refits_of_single_samples(linear, left_out):
+    """Brute force: the samples that matter most, and some others, fitted without them."""
+    subject = FitSubject(linear, linear.records, 250, 0)
+    N = len(subject.places["sample"])
+    chosen = [int(np.argmax(left_out.pareto_k.values)), 0, 17]
+    for i in chosen:
+        other = subject.without(np.arange(N) == i)
+        density = other.pointwise("missing sample")[:, i]
+        weights = arviz_bridge.psis(other.draws.log_ratio)[0]
+        exact = float(logsumexp(weights + density))
+        assert float(left_out.loo_i[i]) == pytest.approx(exact, abs=0.15)
+
+
+def test_entries(linear, left_out, short):
+    assert left_out["target"] == "missing sample"
+    assert left_out["data"] == short.fingerprint
+    assert 1.0 < left_out.p_loo < 12.0  # ten parameters
+    assert 0.0 < left_out["monte_carlo_error"] < 0.5
+    assert left_out.loo_i.dims == ("observation",)
+    assert "60 observations" in str(left_out)
+    naive = linear.log_likelihood(short)[0]
+    assert left_out.elpd_loo > naive  # given samples on both sides, not before alone
+
+
+def test_a_smooth_signal_is_easier_to_fill_in_than_to_forecast(linear, left_out):
+    ahead = dgp.loo(linear, target="forecast", begin=30, refits=1, draws=100, **QUIET)
+    far = dgp.loo(linear, target="forecast", begin=30, horizon=6, refits=1, draws=100, **QUIET)
+    own = left_out.loo_i.values[30:].sum()
+    assert own > ahead.elpd_loo > far.elpd_loo
+    assert far.n_data_points == 30 - 5
+
+
+def test_new_records(linear):
+    found = dgp.loo(linear, target="new record", folds=2, draws=100, **QUIET)
+    assert found["refits"] == 2
+    assert found.n_data_points == 60
+    assert np.isfinite(found.loo_i.values).all()
+
+
+def test_a_change_of_units_enters_by_the_jacobian(short, linear, left_out):
+    """Volts to millivolts, seconds to minutes: the same fit, -log(1000) for each sample."""
+    other = dgp.Record(short.time / 60.0, 5.0 * short.inputs - 2.0, 1000.0 * short.outputs + 7.0)
+    fit = dgp.fit(dgp.LinearDynamicGP(inputs=1, pairs=1), other, restarts=2, **QUIET)
+    found = dgp.loo(fit, target="missing sample", draws=250, **QUIET)
+    expected = left_out.elpd_loo - 60 * np.log(1000.0)
+    assert found.elpd_loo == pytest.approx(expected, abs=4 * left_out["monte_carlo_error"])
+
+
+def test_gaps_and_several_records(one_pair):
+    records = [simulate_record(one_pair, 0.1, n=50, seed=s) for s in (3, 4)]
+    y = records[0].outputs.copy()
+    y[10:14] = np.nan
+    records[0] = records[0].with_outputs(y)
+    fit = dgp.fit(dgp.LinearDynamicGP(inputs=1, pairs=1), records, restarts=2, **QUIET)
+    found = dgp.loo(fit, target="missing sample", refits=0, draws=100, **QUIET)
+    assert found.n_data_points == 96
+    assert set(found.loo_i["record"].values) == {0, 1}
+    assert not np.isin(found.loo_i["sample"].values[:46], range(10, 14)).any()
+    whole = dgp.loo(fit, target="new record", draws=100, **QUIET)
+    assert whole["refits"] == 2
+    assert whole.elpd_loo < found.elpd_loo
+    with pytest.raises(ValueError, match="record: expected one record for 'forecast'"):
+        dgp.loo(fit, target="forecast", **QUIET)
+
+
+def test_conditional_loo_is_wrong_by_tens_of_nats():
+    """A latent Matern-like signal in little noise: what a smoother has seen it does not predict.
+
+    Leave-one-out from densities given the trajectory, log p(y_t | h_t), against the exact one.
+    """
+    modes = dgp.Modes([-8.0 + 4.0j], np.zeros((1, 0)), [1.0], [[3.0]])
+    time, sd = 0.05 * np.arange(150), 0.1
+    process = dgp.LTIProcess(modes, time)
+    with torch.random.fork_rng(), torch.no_grad():
+        torch.manual_seed(0)
+        y = process.observed(sd).sample()
+        exact = float(np.sum(pointwise_log_density(process.observed(sd), y, "missing sample")))
+        h = process.condition(y, sd).sample((2000,)).numpy()
+    conditional = norm.logpdf(y.numpy(), h, sd)
+    log_weights, k = arviz_bridge.psis(-conditional.T)
+    naive = float(logsumexp(log_weights + conditional.T, axis=1).sum())
+    assert naive - exact > 20.0  # and that is after smoothing the weights
+    assert np.mean(k > arviz_bridge.good_k(2000)) > 0.3
+
+
+def test_what_is_refused(linear, short):
+    with pytest.raises(ValueError, match=r"target: expected one of .* Name what the model is for"):
+        dgp.loo(linear, target="loo", **QUIET)
+    with pytest.raises(TypeError):
+        dgp.loo(linear)  # no default target
+    with pytest.raises(ValueError, match="record: expected the training record"):
+        dgp.loo(linear, short[:40], target="missing sample", **QUIET)
+    with pytest.raises(ValueError, match="begin: expected a share between 0 and 1"):
+        dgp.loo(linear, target="forecast", begin=1.5, **QUIET)
+    with pytest.raises(ValueError, match="folds: expected a whole number from 2"):
+        dgp.loo(linear, target="new record", folds=1, **QUIET)
+    with pytest.raises(ValueError, match="refits: expected a whole number"):
+        dgp.loo(linear, target="missing sample", refits=-1, **QUIET)
+    with pytest.raises(ValueError, match="fit: expected a Fit, or a Subject"):
+        dgp.loo("fit", target="missing sample", **QUIET)
+    with pytest.raises(ValueError, match="knows its training records"):
+        dgp.loo(replace(linear, records=()), target="missing sample", **QUIET)
+    with pytest.raises(ValueError, match="without refits for a model of your own"):
+        dgp.loo(NormalMean().subject, target="new record", **QUIET)
+
+
+def test_draws_where_a_normal_will_not_do(short):
+    """Three pairs for a system of one: Laplace's draws are no posterior, annealed ones are."""
+    fit = dgp.fit(dgp.LinearDynamicGP(inputs=1, pairs=3), short, restarts=2, **QUIET)
+    own = draws_of(fit, count=400, anneal=False)
+    assert float(arviz_bridge.psis(own.log_ratio)[1]) > 0.7
+    found = draws_of(fit, count=100)
+    assert found.kind.startswith("annealed from Laplace's approximation")
+    assert found.log_q is None
+    # -log p over draws of a d-dimensional posterior spreads by about sqrt(d/2), d = 24.
+    assert 2.0 < np.std(found.log_p) < 7.0
+    assert np.std(own.log_p) > 20.0
