@@ -1,0 +1,57 @@
+"""Fits made again on other data: same scaling and family, near the old optimum, refusals."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import pyro_dynogp as dgp
+from pyro_dynogp.inference.guides import MixtureGuide
+from pyro_dynogp.inference.refit import optima_of, refit
+from tests.inference.cascades import FAST, wiener
+
+
+def test_on_the_same_data_a_mode_stays(map_fit):
+    again = refit(map_fit, map_fit.records)
+    for name, value in map_fit.mode.items():
+        torch.testing.assert_close(again.mode[name], value, atol=0.05, rtol=0.05)
+    assert again.log_joint(map_fit.records[0]) == pytest.approx(
+        map_fit.log_joint(map_fit.records[0]), abs=0.1
+    )
+
+
+def test_on_other_data_the_scaling_stays_and_the_mode_moves(map_fit, record):
+    rest = record[:80]
+    again = refit(map_fit, rest)
+    assert again.scaling == map_fit.scaling
+    assert again.records == (rest,)
+    assert not torch.equal(again.mode["g_log_decay"], map_fit.mode["g_log_decay"])
+    assert again.log_joint(rest) > map_fit.log_joint(rest)
+
+
+def test_svi_keeps_its_family(svi_fit, record):
+    again = refit(svi_fit, record[: len(svi_fit.records[0]) - 20])
+    assert again.method == "svi"
+    assert type(again.posterior) is type(svi_fit.posterior)
+    assert again.draws["noise_sd"].shape == svi_fit.draws["noise_sd"].shape
+
+
+def test_a_cascade_keeps_its_optima(bent):
+    fit = dgp.fit(wiener(), bent, **{**FAST, "restarts": 3, "steps": 20, "draws": 20})
+    assert isinstance(fit.posterior, MixtureGuide)
+    optima = optima_of(fit)
+    assert len(optima) == len(fit.posterior.weights)
+    torch.testing.assert_close(optima[0]["g_log_decay"], fit.mode["g_log_decay"])
+    y = bent.outputs.copy()
+    y[30:40] = np.nan
+    again = refit(fit, bent.with_outputs(y))
+    assert isinstance(again.posterior, MixtureGuide)
+    assert len(again.draws["f_values"]) == 20
+
+
+def test_what_is_refused(map_fit, layered_fit, record):
+    with pytest.raises(ValueError, match="fit: expected a fit whose trajectories are integrated"):
+        refit(layered_fit, layered_fit.records)
+    with pytest.raises(ValueError, match="records: expected 1, as before"):
+        refit(replace(map_fit), (record, record))
