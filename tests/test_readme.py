@@ -53,9 +53,53 @@ def test_a_deep_model_is_fitted(tmp_path, monkeypatch, one_pair):
     assert (tmp_path / "run1").is_dir()
 
 
+def test_a_fit_is_criticised(one_pair):
+    record = simulate_record(one_pair, 0.1, n=100)
+    quick = {"workers": 1, "progress": False}
+    train, test = record.split(70)
+    names: dict = {
+        "dgp": dgp,
+        "train": train,
+        "test": test,
+        "linear": dgp.fit(dgp.LinearDynamicGP(1, pairs=1), train, restarts=1, **quick),
+        "fit": dgp.fit(
+            dgp.Wiener(1, pairs=1, inducing=6), train, restarts=1, steps=20, draws=50, **quick
+        ),
+    }
+    code = blocks()[2]
+    for target in ("missing sample", "forecast"):
+        fast = f'target="{target}", draws=100, refits=0, workers=1, progress=False'
+        code = code.replace(f'target="{target}"', fast)
+    exec(code, names)
+    assert names["data"].predictions["y"].shape[-2:] == (30, 1)
+    assert names["elpd"]["target"] == "missing sample"
+    assert set(names["table"].weights) == {"linear", "wiener"}
+
+
+def test_any_pyro_model_is_criticised(one_pair):
+    record = simulate_record(one_pair, 0.1, n=50)
+
+    def model(record):
+        data = record.tensors()
+        scale = dgp.TimeScale(step=record.sampling_time, duration=record.duration)
+        modes = dgp.sample_modes("g", inputs=1, pairs=1, time_scale=scale)
+        sigma = pyro.sample("sigma", pyro.distributions.HalfNormal(torch.tensor(1.0).double()))
+        process = dgp.LTIProcess(modes, data.time, data.inputs)
+        pyro.sample("y", process.observed(sigma), obs=data.outputs[:, 0])
+
+    with pyro.get_param_store().scope():
+        guide = AutoNormal(model)
+        svi = SVI(model, guide, pyro.optim.Adam({"lr": 0.05}), Trace_ELBO())
+        for _ in range(20):
+            svi.step(record)
+        names: dict = {"dgp": dgp, "model": model, "guide": guide, "record": record}
+        exec(blocks()[3], names)
+    assert names["posterior"].draws.log_q is not None
+
+
 def test_custom_model_trains(one_pair):
     names: dict = {}
-    exec(blocks()[2], names)
+    exec(next(block for block in blocks() if "def model(record)" in block), names)
     model, record = names["model"], simulate_record(one_pair, 0.1, n=60)
     pyro.set_rng_seed(0)
     with pyro.get_param_store().scope():
