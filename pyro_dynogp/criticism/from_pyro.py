@@ -75,6 +75,14 @@ def from_pyro(
         each = [_at(model, args, found.values, s) for s in range(len(found))]
     first = each[0]
     seen = _observed(first)
+    for name in seen:
+        if not all(_same(first[name]["value"], nodes[name]["value"]) for nodes in each):
+            raise invalid(
+                f"site {name!r}",
+                expected="data that are the same for every draw",
+                got="values that depend on latent sites",
+                advice="Put what is subtracted from the data into the distribution's mean.",
+            )
     log_p = [sum(float(node["log_prob_sum"]) for node in nodes.values()) for nodes in each]
     return PyroPosterior(
         draws=replace(found, log_p=np.array(log_p)),
@@ -147,6 +155,11 @@ def _observed(nodes: Nodes) -> list[str]:
                 advice="Mark missing samples by NaN.",
             )
     return names
+
+
+def _same(a: Tensor, b: Tensor) -> bool:
+    """Equal, gaps included."""
+    return a.shape == b.shape and bool(((a == b) | (torch.isnan(a) & torch.isnan(b))).all())
 
 
 def _scored(node: Any) -> Any:

@@ -145,6 +145,9 @@ def forecast(
     whole = arviz_bridge.psis(log_ratio)[0]
     found.lppd = float(mixture(np.broadcast_to(whole, (len(scored), len(whole))),
                                target[:, scored]).sum())  # fmt: skip
+    if len(whole) == 1:  # one draw weighs what it weighs, whatever is left out
+        found.elpd = target[0, scored]
+        return found
     shares: list[np.ndarray] = []
     end = len(sample)  # data before this one are in the current fit
     bar = tqdm(total=len(scored), desc="forecasts", disable=not progress)

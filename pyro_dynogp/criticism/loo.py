@@ -10,7 +10,7 @@ import numpy as np
 from pyro_dynogp._errors import invalid
 from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.left_out import Base, Found, forecast, missing_sample, new_record
-from pyro_dynogp.criticism.subjects import FitSubject, Subject
+from pyro_dynogp.criticism.subjects import FitSubject, Parameters, Subject
 from pyro_dynogp.record import Record, as_records
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ def loo(
     begin: int | float = 0.5,
     folds: int = 5,
     draws: int = 1000,
+    parameters: Parameters = "posterior",
     refits: int = MOST_REFITS,
     seed: int = 0,
     workers: int | None = None,
@@ -54,6 +55,9 @@ def loo(
             record.
         folds: of "new record", contiguous blocks of a single record.
         draws: of the posterior (of NUTS all).
+        parameters: "posterior", or "mode" for densities with all parameters at the mode, which has
+            seen the data: O(n) and quick, and kind to models of many parameters. For records so
+            long that parameters are all but known.
         refits: most fits that are made again where Pareto's k is above ArviZ's good_k
             ("new record" makes one for each fold whatever this says).
         seed: for the draws. workers: processes for refits. progress: whether to show a bar.
@@ -79,7 +83,7 @@ def loo(
         )
     if not isinstance(refits, int) or refits < 0:
         raise invalid("refits", expected="a whole number >= 0", got=repr(refits))
-    subject = subject_of(fit, record, draws, seed)
+    subject = subject_of(fit, record, draws, seed, parameters)
     if target == "missing sample":
         found = missing_sample(subject, refits, workers, progress)
     elif target == "forecast":
@@ -90,7 +94,11 @@ def loo(
 
 
 def subject_of(
-    fit: Any, record: Record | Sequence[Record] | None, draws: int, seed: int
+    fit: Any,
+    record: Record | Sequence[Record] | None,
+    draws: int,
+    seed: int,
+    parameters: Parameters = "posterior",
 ) -> Subject:
     """What `loo` works on."""
     from pyro_dynogp.inference.result import Fit
@@ -111,7 +119,9 @@ def subject_of(
             advice="Data that the fit has not seen are scored directly: dgp.scores, or "
             "fit.log_likelihood.",
         )
-    return FitSubject(fit, fit.records, draws, seed)
+    if parameters not in ("posterior", "mode"):
+        raise invalid("parameters", expected="'posterior' or 'mode'", got=repr(parameters))
+    return FitSubject(fit, fit.records, draws, seed, parameters)
 
 
 def _elpd(subject: Subject, found: Found, target: str, horizon: int) -> Any:

@@ -141,9 +141,18 @@ def _of_normal(
     single = np.zeros(count, dtype=int)
     drawn = PosteriorDraws(values, log_joint(fit, values), log_q, single, kind)
     k = float(arviz_bridge.psis(drawn.log_ratio)[1])
-    # A cascade costs too much for that: its draws are left as they are, and k says so.
-    if not anneal or k <= arviz_bridge.good_k(count) or isinstance(fit.model, Cascade):
+    if not anneal or k <= arviz_bridge.good_k(count):
         return drawn
+    if isinstance(fit.model, Cascade):  # annealing would take an hour
+        if fit.method == "svi":
+            return drawn  # the posterior that was chosen; its k goes with every result
+        raise invalid(
+            "fit",
+            expected="a posterior that can be drawn from",
+            got=f"a posterior mode around which Laplace's approximation is useless (k = {k:.2f})",
+            advice="Fit with method='svi' (the default of cascades) or 'nuts', or use "
+            "parameters='mode'.",
+        )
     particles = min(count, PARTICLES)
     z, start = annealing.around(normal, particles, seed)
     target = annealing.Joint(_target(fit), (_argument(fit.records),), normal.sites)

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 import torch
@@ -23,6 +23,9 @@ from pyro_dynogp.record import Record
 
 if TYPE_CHECKING:
     from pyro_dynogp.inference.result import Fit
+
+
+Parameters = Literal["posterior", "mode"]
 
 
 class Subject(Protocol):
@@ -57,16 +60,21 @@ class FitSubject:
     Attributes:
         fit: the fit; of `records`, or of less of them.
         records: where densities are evaluated. count, seed: of the draws.
+        parameters: "posterior", or "mode" for the mode alone.
     """
 
     fit: Fit
     records: tuple[Record, ...]
     count: int
     seed: int
+    parameters: Parameters = "posterior"
 
     @cached_property
     def draws(self) -> PosteriorDraws:
-        """Draws (S) of the posterior."""
+        """Draws (S) of the posterior, or the mode as the only one."""
+        if self.parameters == "mode":
+            values = {name: value.unsqueeze(0) for name, value in self.fit.mode.items()}
+            return PosteriorDraws(values, None, None, np.zeros(1, dtype=int), "at the mode")
         return draws_of(self.fit, count=self.count, seed=self.seed)
 
     @cached_property
@@ -83,7 +91,7 @@ class FitSubject:
     @property
     def data(self) -> str:
         """Fingerprint of the data, gaps included."""
-        return "+".join(record.fingerprint for record in self.records)
+        return fingerprint_of([record.outputs for record in self.records])
 
     def pointwise(self, kind: Kind, horizon: int = 1) -> np.ndarray:
         """Log-densities (S, N)."""
@@ -195,9 +203,13 @@ def _no_refit() -> ValueError:
 
 
 def fingerprint_of(outputs: Sequence[np.ndarray]) -> str:
-    """Hex SHA-256 of arrays of outputs."""
+    """Hex SHA-256 of outputs (n,) or (n, n_y), gaps included: what densities can be compared on.
+
+    Inputs and clocks do not count, since models may use other ones.
+    """
     digest = hashlib.sha256()
-    for one in outputs:
+    for given in outputs:
+        one = given[:, 0] if given.ndim == 2 and given.shape[1] == 1 else given
         plain = np.where(np.isnan(one), np.nan, one + 0.0).astype("<f8")
         digest.update(repr(plain.shape).encode() + plain.tobytes())
     return digest.hexdigest()

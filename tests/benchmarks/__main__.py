@@ -14,6 +14,7 @@ import torch
 from tests.benchmarks import (
     calibration,
     cascade_cost,
+    criticism,
     electricity,
     example2,
     guides,
@@ -31,6 +32,7 @@ PARTS = {
     "electricity": electricity.run,
     "reference": reference.run,
     "calibration": calibration.run,
+    "criticism": criticism.run,
 }
 
 

@@ -386,3 +386,14 @@ class TestRefusals:
             found.without(np.zeros(9, dtype=bool))
         with pytest.raises(ValueError, match="one without refits"):
             found.fresh(0, 0, 3)
+
+
+def test_data_that_depend_on_a_latent_site_are_refused():
+    y = torch.linspace(2.0, 4.0, 20, dtype=torch.float64)
+
+    def model():
+        level = pyro.sample("level", dist.Normal(torch.tensor(0.0).double(), 5.0))
+        pyro.sample("y", dist.Normal(torch.zeros(20).double(), 1.0).to_event(1), obs=y - level)
+
+    with pytest.raises(ValueError, match="site 'y': expected data that are the same for every"):
+        from_pyro(model, {"level": torch.tensor([0.0, 3.0, 5.0], dtype=torch.float64)})

@@ -3,8 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
+import pyro
+import pyro.distributions as dist
 import pytest
 import torch
+from pyro.infer import SVI, Trace_ELBO
+from pyro.infer.autoguide import AutoNormal
 from scipy.special import logsumexp
 from scipy.stats import norm
 
@@ -137,7 +141,7 @@ def test_exact_refits_of_single_samples(linear, left_out):
 
 def test_entries(linear, left_out, short):
     assert left_out["target"] == "missing sample"
-    assert left_out["data"] == short.fingerprint
+    assert left_out["data"] == fingerprint_of([short.outputs[:, 0]])
     assert 1.0 < left_out.p_loo < 12.0  # ten parameters
     assert 0.0 < left_out["monte_carlo_error"] < 0.5
     assert left_out.loo_i.dims == ("observation",)
@@ -152,6 +156,17 @@ def test_a_smooth_signal_is_easier_to_fill_in_than_to_forecast(linear, left_out)
     own = left_out.loo_i.values[30:].sum()
     assert own > ahead.elpd_loo > far.elpd_loo
     assert far.n_data_points == 30 - 5
+
+
+def test_at_the_mode(linear, short, left_out):
+    """One-step densities add up to the likelihood; parameters that have seen the data flatter."""
+    found = dgp.loo(linear, target="forecast", begin=2, parameters="mode", **QUIET)
+    process = dgp.loo(linear, target="missing sample", parameters="mode", **QUIET)
+    assert process.n_samples == 1
+    assert process.elpd_loo > left_out.elpd_loo
+    first = FitSubject(linear, linear.records, 1, 0, "mode").pointwise("forecast")[0, :2].sum()
+    assert found.elpd_loo + first == pytest.approx(linear.log_likelihood(short)[0], rel=1e-9)
+    assert found["refits"] == found["not_refitted"] == 0
 
 
 def test_new_records(linear):
@@ -218,6 +233,8 @@ def test_what_is_refused(linear, short):
         dgp.loo(linear, target="forecast", begin=1.5, **QUIET)
     with pytest.raises(ValueError, match="folds: expected a whole number from 2"):
         dgp.loo(linear, target="new record", folds=1, **QUIET)
+    with pytest.raises(ValueError, match="parameters: expected 'posterior' or 'mode'"):
+        dgp.loo(linear, target="missing sample", parameters="map", **QUIET)
     with pytest.raises(ValueError, match="refits: expected a whole number"):
         dgp.loo(linear, target="missing sample", refits=-1, **QUIET)
     with pytest.raises(ValueError, match="fit: expected a Fit, or a Subject"):
@@ -239,3 +256,52 @@ def test_draws_where_a_normal_will_not_do(short):
     # -log p over draws of a d-dimensional posterior spreads by about sqrt(d/2), d = 24.
     assert 2.0 < np.std(found.log_p) < 7.0
     assert np.std(own.log_p) > 20.0
+
+
+def test_the_mode_of_a_cascade_is_no_posterior(bent):
+    options = {"restarts": 1, "steps": 60, "method": "map"}
+    fit = dgp.fit(dgp.Wiener(1, pairs=1, inducing=6), bent[:60], **options, **QUIET)
+    with pytest.raises(ValueError, match=r"fit: expected a posterior that can be drawn from"):
+        dgp.loo(fit, target="missing sample", draws=100, **QUIET)
+    found = dgp.loo(fit, target="missing sample", parameters="mode", **QUIET)
+    assert np.isfinite(found.elpd_loo)
+
+
+def test_a_cascade_with_its_optima(bent):
+    """Ratios of inducing values and first states are good; what they leave out is said."""
+    options = {"restarts": 2, "steps": 150}
+    fit = dgp.fit(dgp.Wiener(1, pairs=1, inducing=6), bent[:60], **options, **QUIET)
+    found = dgp.loo(fit, target="missing sample", draws=200, refits=0, **QUIET)
+    assert found["posterior_k"] < 1.0
+    assert "hyperparameters='multivariate normal'" in " ".join(found["notes"])
+    N = 60
+    subject = FitSubject(fit, fit.records, 200, 0)
+    i = int(np.argsort(found.pareto_k.values)[N // 2])
+    other = subject.without(np.arange(N) == i)
+    density = other.pointwise("missing sample")[:, i]
+    exact = float(logsumexp(arviz_bridge.psis(other.draws.log_ratio)[0] + density))
+    assert float(found.loo_i[i]) == pytest.approx(exact, abs=0.3)
+
+
+def test_a_fit_and_a_model_of_the_user_are_compared(short, linear):
+    """The user's own model without process noise, on the same record."""
+
+    def model(record):
+        data = record.tensors()
+        scale = dgp.TimeScale(step=record.sampling_time, duration=record.duration)
+        modes = dgp.sample_modes("g", inputs=1, pairs=1, process_noise=False, time_scale=scale)
+        sigma = pyro.sample("sigma", dist.HalfNormal(torch.tensor(1.0).double()))
+        process = dgp.LTIProcess(modes, data.time, data.inputs)
+        pyro.sample("y", process.observed(sigma), obs=data.outputs[:, 0])
+
+    with pyro.get_param_store().scope(), torch.random.fork_rng():
+        torch.manual_seed(0)
+        guide = AutoNormal(model)
+        svi = SVI(model, guide, pyro.optim.Adam({"lr": 0.05}), Trace_ELBO())
+        for _ in range(150):
+            svi.step(short)
+        own = dgp.from_pyro(model, guide, short, draws=150)
+    models = {"own": own, "linear": linear}
+    found = dgp.compare(models, target="missing sample", draws=150, refits=0, **QUIET)
+    assert found.table.index[0] == "linear"
+    assert found.table.loc["own", "clear"]
