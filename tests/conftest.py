@@ -9,7 +9,7 @@ from hypothesis import settings
 
 import pyro_dynogp as dgp
 
-# Tests run in as many processes as there are processors: more threads would only wait for each other.
+# As many processes run tests as there are processors: more threads would wait for each other.
 torch.set_num_threads(1)
 settings.register_profile("deterministic", derandomize=True, deadline=None)
 settings.load_profile("deterministic")
