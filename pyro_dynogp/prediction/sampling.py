@@ -263,7 +263,8 @@ def draw_outputs(system: CascadeSystem, time: Any, inputs: Tensor, shape: torch.
     problem = assemble(system, grid, inputs).problem
     start = JointState(known_start(system), problem.P0)
     random = Randomness.draw(system, len(grid), shape)
-    drawn = draw_layers(system, grid, inputs, start, random, Switches.all_on(system))
+    on = Switches.all_on(system, several_channels=True)  # the model as it is stated
+    drawn = draw_layers(system, grid, inputs, start, random, on)
     signal = drawn.signals[system.wires[-1].name]
     if system.offset is not None:
         signal = signal + system.offset.unsqueeze(-2)
