@@ -43,9 +43,7 @@ def psis(log_ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     equal = np.ptp(flat, axis=-1) < 1e-12
     k[equal] = 0.0
     if count >= 25 and not equal.all():
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of infinite k, which is what we return
-            smoothed, shape = _arviz().psislw(flat[~equal].copy())
+        smoothed, shape = _arviz().psislw(flat[~equal].copy())
         out[~equal], k[~equal] = smoothed, np.atleast_1d(shape)
     return out.reshape(log_ratio.shape), k.reshape(log_ratio.shape[:-1])
 
@@ -68,8 +66,6 @@ def elpd_data(
         warning: whether something is not reliable.
         coords: (N,) what tells the samples apart. extra: further entries.
     """
-    from arviz.stats.stats_utils import ELPDData
-
     labels = {name: ("observation", value) for name, value in coords.items()}
     pointwise = xr.DataArray(elpd, dims="observation", coords=labels, name="loo_i")
     entries = {
@@ -85,7 +81,12 @@ def elpd_data(
         "good_k": good_k(draws),
         **extra,
     }
-    return ELPDData(data=list(entries.values()), index=list(entries))
+    return _elpd(entries)
+
+
+def _elpd(entries: Mapping[str, Any]) -> Any:
+    """ArviZ's class of these entries, in their order."""
+    return _arviz().stats.stats_utils.ELPDData(data=list(entries.values()), index=list(entries))
 
 
 ARVIZ_ENTRIES = (
@@ -96,14 +97,10 @@ ARVIZ_ENTRIES = (
 
 def compare_table(elpds: Mapping[str, Any], method: str) -> Any:
     """`arviz.compare` of ELPDData by name, weights by `method`."""
-    from arviz.stats.stats_utils import ELPDData
-
-    plain = {
-        name: ELPDData(data=[one[e] for e in ARVIZ_ENTRIES], index=list(ARVIZ_ENTRIES))
-        for name, one in elpds.items()
-    }
+    plain = {name: _elpd({e: one[e] for e in ARVIZ_ENTRIES}) for name, one in elpds.items()}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+        # ArviZ sorts tables in a way that pandas 4 will not have.
+        warnings.simplefilter("ignore", DeprecationWarning)
         return _arviz().compare(plain, ic="loo", method=method, scale="log")
 
 
@@ -114,9 +111,6 @@ def inference_data(groups: Mapping[str, xr.Dataset], attrs: Mapping[str, Any]) -
         groups: datasets by the name of their group, in any order.
         attrs: of the whole, repeated in every group, so that a group by itself still has them.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return _arviz().InferenceData(
-            attrs=dict(attrs),
-            **{name: group.assign_attrs(attrs) for name, group in groups.items()},
-        )
+    return _arviz().InferenceData(
+        attrs=dict(attrs), **{name: group.assign_attrs(attrs) for name, group in groups.items()}
+    )

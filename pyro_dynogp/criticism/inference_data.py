@@ -16,19 +16,19 @@ from torch import Tensor
 import pyro_dynogp
 from pyro_dynogp._errors import invalid
 from pyro_dynogp.criticism import arviz_bridge
-from pyro_dynogp.criticism.densities import pointwise_log_density
 from pyro_dynogp.criticism.labelled import Coordinate, Variable, clock_of, dataset_of, units_of
 from pyro_dynogp.criticism.physical import physical_quantities
-from pyro_dynogp.criticism.posterior_draws import AT_ONCE, PosteriorDraws, log_joint
+from pyro_dynogp.criticism.posterior_draws import PosteriorDraws, log_joint, with_draws
 from pyro_dynogp.criticism.site_dimensions import (
     dimensions_for,
     labels_of,
     site_dimensions,
     suffixes_of,
 )
+from pyro_dynogp.criticism.subjects import densities_at
 from pyro_dynogp.inference.guides import MixtureGuide
 from pyro_dynogp.models.cascade import Cascade
-from pyro_dynogp.models.collapsed import collapsed_of, outputs_with_gaps
+from pyro_dynogp.models.collapsed import collapsed_of
 from pyro_dynogp.parallel import seeded
 from pyro_dynogp.prediction.beginning import beginning
 from pyro_dynogp.prediction.linear import prior_process
@@ -121,7 +121,7 @@ class _Export:
         if self.count <= self.samples:
             return self.fit
         index = np.linspace(0, self.count - 1, self.samples).round().astype(int)
-        return _with_draws(self.fit, {k: v[index] for k, v in self.fit.draws.items()})
+        return with_draws(self.fit, {k: v[index] for k, v in self.fit.draws.items()})
 
     def posterior(self) -> xr.Dataset:
         """Every latent site, trajectories too, and what follows from them in physical units."""
@@ -138,7 +138,7 @@ class _Export:
         note = "outputs from the inputs alone, jointly, at prior draws"
         return {
             "prior": dataset_of(self._sites(values) | derived, self.labels, {}, chains=1),
-            "prior_predictive": self.replicates(_with_draws(fit, values), count, note),
+            "prior_predictive": self.replicates(with_draws(fit, values), count, note),
         }
 
     def _sites(self, values: Mapping[str, Tensor]) -> dict[str, Variable]:
@@ -255,7 +255,7 @@ def prior_draws(fit: Fit, count: int, seed: int) -> tuple[dict[str, Tensor], Any
     Args:
         fit: says the model and the scaling. count: S. seed: for the draws.
     """
-    model = fit.model.collapsed if isinstance(fit.model, Cascade) else fit.model
+    model = fit.model.collapsed
     with (
         seeded(seed),
         torch.no_grad(),
@@ -271,25 +271,13 @@ def prior_draws(fit: Fit, count: int, seed: int) -> tuple[dict[str, Tensor], Any
 
 def one_step_densities(fit: Fit, record: Record) -> np.ndarray:
     """Log-density (S, n, n_y) [nats] of each output given those before it, at each draw."""
-    portion = max(1, AT_ONCE // (len(record) * record.n_outputs))
-    count = len(next(iter(fit.draws.values())))
-    parts = []
-    for first in range(0, count, portion):
-        some = _with_draws(fit, {k: v[first : first + portion] for k, v in fit.draws.items()})
-        with torch.no_grad():
-            observed: Any
-            if isinstance(some.model, Cascade):
-                observed = collapsed_of(beginning(some, record), some.scaling, record)
-            else:
-                observed = prior_process(some, record).observed(some.system.noise_sd)
-            y = outputs_with_gaps(record)
-            parts.append(pointwise_log_density(observed, y, "forecast"))
-    return np.concatenate(parts)
 
+    def observed(some: Fit) -> Any:
+        if isinstance(some.model, Cascade):
+            return collapsed_of(beginning(some, record), some.scaling, record)
+        return prior_process(some, record).observed(some.system.noise_sd)
 
-def _with_draws(fit: Fit, values: Mapping[str, Tensor]) -> Fit:
-    """The fit with other draws, for what is computed from draws alone."""
-    return replace(fit, draws=values, posterior=None, trajectories={}, log_q_sites={})
+    return densities_at(fit, fit.draws, record, observed, "forecast")
 
 
 def _inputs_of(record: Record, suffix: str) -> Variable:

@@ -29,11 +29,13 @@ class Base:
 
     Attributes:
         log_ratio: (S,) of posterior over proposal, zeros where uncorrected.
+        log_weights: (S,) normalised and smoothed.
         k: Pareto shape of the proposal; 0 for draws of the posterior itself.
         corrected: whether the ratios are used.
     """
 
     log_ratio: np.ndarray
+    log_weights: np.ndarray
     k: float
     corrected: bool
 
@@ -41,9 +43,11 @@ class Base:
     def of(cls, subject: Subject) -> Base:
         """Ratios, or none where the posterior's own k says that they are not to be trusted."""
         ratio = subject.draws.log_ratio
-        k = float(arviz_bridge.psis(ratio)[1])
-        corrected = bool(k <= arviz_bridge.good_k(len(ratio)))
-        return cls(ratio if corrected else np.zeros_like(ratio), k, corrected)
+        log_weights, k = arviz_bridge.psis(ratio)
+        if k <= arviz_bridge.good_k(len(ratio)):
+            return cls(ratio, log_weights, float(k), True)
+        plain = np.full(len(ratio), -np.log(len(ratio)))
+        return cls(np.zeros_like(ratio), plain, float(k), False)
 
 
 @dataclass
@@ -51,11 +55,12 @@ class Found:
     """What a target came to, sample by sample.
 
     Attributes:
-        index: (N,) place of each scored sample among all measured ones.
+        base: weights of the draws. index: (N,) place of each scored sample among all measured ones.
         elpd, k: (N,). lppd: with the posterior of all data. error: Monte Carlo standard error.
         refits: how many. left: samples whose k is too high, not refitted.
     """
 
+    base: Base
     index: np.ndarray
     elpd: np.ndarray
     k: np.ndarray
@@ -86,12 +91,12 @@ def missing_sample(subject: Subject, most: int, workers: int | None, progress: b
     base = Base.of(subject)
     log_weights, k = arviz_bridge.psis(base.log_ratio - density.T)
     elpd = mixture(log_weights, density)
-    whole = arviz_bridge.psis(base.log_ratio)[0]
+    whole = base.log_weights
     lppd = float(mixture(np.broadcast_to(whole, log_weights.shape), density).sum())
     error = monte_carlo_error(log_weights, density, elpd)
     N = density.shape[1]
-    found = Found(np.arange(N), elpd, k, lppd, error)
-    _note(found, subject, base)
+    found = Found(base, np.arange(N), elpd, k, lppd, error)
+    _note(found, subject)
     high = np.flatnonzero(k > arviz_bridge.good_k(len(whole)))
     worst = high[np.argsort(-k[high])][:most]
     found.left = len(high) - len(worst)
@@ -111,8 +116,7 @@ def missing_sample(subject: Subject, most: int, workers: int | None, progress: b
 def _one_left_out(subject: Subject, i: int, N: int) -> float:
     other = subject.without(np.arange(N) == i)
     density = other.pointwise("missing sample")[:, i]
-    weights = arviz_bridge.psis(Base.of(other).log_ratio)[0]
-    return float(logsumexp(weights + density))
+    return float(logsumexp(Base.of(other).log_weights + density))
 
 
 def forecast(
@@ -135,14 +139,13 @@ def forecast(
             "begin", expected="samples before and after it", got=repr(begin),
             advice="Give the number of samples that the first forecast may use.",
         )  # fmt: skip
-    current = subject
-    step, target = _both(current, horizon)
-    base = Base.of(current)
+    step, target = _both(subject, horizon)
+    base = Base.of(subject)
     log_ratio = base.log_ratio
     good = arviz_bridge.good_k(len(log_ratio))
-    found = Found(scored, np.zeros(len(scored)), np.zeros(len(scored)), 0.0, 0.0)
-    _note(found, subject, base)
-    whole = arviz_bridge.psis(log_ratio)[0]
+    found = Found(base, scored, np.zeros(len(scored)), np.zeros(len(scored)), 0.0, 0.0)
+    _note(found, subject)
+    whole = base.log_weights
     found.lppd = float(mixture(np.broadcast_to(whole, (len(scored), len(whole))),
                                target[:, scored]).sum())  # fmt: skip
     if len(whole) == 1:  # one draw weighs what it weighs, whatever is left out
@@ -212,10 +215,10 @@ def new_record(subject: Subject, folds: int, workers: int | None, progress: bool
     k = np.concatenate([np.full(len(one[0]), one[1]) for one in results])
     error = float(np.sqrt(sum(one[2] ** 2 for one in results)))
     base = Base.of(subject)
-    weights = arviz_bridge.psis(base.log_ratio)[0]
+    weights = base.log_weights
     lppd = sum(float(_chain(weights, subject.fresh(*block[1]))[0].sum()) for block in blocks)
-    found = Found(order, elpd, k, lppd, error, refits=len(blocks))
-    _note(found, subject, base)
+    found = Found(base, order, elpd, k, lppd, error, refits=len(blocks))
+    _note(found, subject)
     found.left = int((k > arviz_bridge.good_k(len(weights))).sum())
     return found
 
@@ -250,8 +253,7 @@ def _held_out(subject: Subject, block: Block) -> tuple[np.ndarray, float, float]
     left_out[own] = True
     other = subject.without(left_out)
     base = Base.of(other)
-    log_weights = arviz_bridge.psis(base.log_ratio)[0]
-    elpd, error = _chain(log_weights, other.fresh(*where))
+    elpd, error = _chain(base.log_weights, other.fresh(*where))
     return elpd, base.k, error
 
 
@@ -267,11 +269,11 @@ def _chain(log_weights: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, float
     return np.diff(joint, prepend=logsumexp(log_weights)), error
 
 
-def _note(found: Found, subject: Subject, base: Base) -> None:
-    if not base.corrected:
+def _note(found: Found, subject: Subject) -> None:
+    if not found.base.corrected:
         found.notes.append(
-            f"Pareto's k of the posterior itself is {base.k:.2f}: its draws are taken as they are, "
-            "without the ratios p/q."
+            f"Pareto's k of the posterior itself is {found.base.k:.2f}: its draws are taken as "
+            "they are, without the ratios p/q."
         )
     if "at each optimum" in subject.draws.kind:
         found.notes.append(

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
 from pyro_dynogp._errors import invalid
 from pyro_dynogp.criticism import arviz_bridge
-from pyro_dynogp.criticism.left_out import Base, Found, forecast, missing_sample, new_record
+from pyro_dynogp.criticism.left_out import Found, forecast, missing_sample, new_record
 from pyro_dynogp.criticism.subjects import FitSubject, Parameters, Subject
 from pyro_dynogp.record import Record, as_records
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pyro_dynogp.inference.result import Fit
 
 Target = Literal["missing sample", "forecast", "new record"]
-TARGETS = ("missing sample", "forecast", "new record")
+TARGETS = get_args(Target)
 # Refits that are made without being asked for more.
 MOST_REFITS = 30
 
@@ -125,7 +125,6 @@ def subject_of(
 
 
 def _elpd(subject: Subject, found: Found, target: str, horizon: int) -> Any:
-    base_k = float(arviz_bridge.psis(subject.draws.log_ratio)[1])
     count = len(subject.draws)
     if found.left:
         found.notes.append(
@@ -145,8 +144,8 @@ def _elpd(subject: Subject, found: Found, target: str, horizon: int) -> Any:
             "horizon": horizon,
             "data": subject.data,
             "draws_from": subject.draws.kind,
-            "posterior_k": base_k,
-            "corrected": Base.of(subject).corrected,
+            "posterior_k": found.base.k,
+            "corrected": found.base.corrected,
             "monte_carlo_error": found.error,
             "refits": found.refits,
             "not_refitted": found.left,

@@ -17,7 +17,7 @@ from pyro_dynogp._errors import invalid
 from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.inference import annealing
 from pyro_dynogp.inference.guides import GaussianGuide, MixtureGuide, gaussian_guide
-from pyro_dynogp.inference.potential import Potential
+from pyro_dynogp.inference.potential import Potential, log_prob_by_draw
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
 from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.parallel import seeded
@@ -125,7 +125,7 @@ def _of_optima(fit: Fit, guide: MixtureGuide, count: int, seed: int) -> Posterio
 def laplace(fit: Fit, values: Values) -> GaussianGuide:
     """Normal around an optimum, from the Hessian of the log joint density there."""
     with seeded(fit.seed):
-        potential = Potential(_target(fit), (_argument(fit.records),), values)
+        potential = Potential(fit.model.collapsed, (_argument(fit.records),), values)
         centre, root = potential.laplace(values, widest=WIDEST)
     return gaussian_guide(potential, torch.as_tensor(centre), torch.as_tensor(root))
 
@@ -155,10 +155,10 @@ def _of_normal(
         )
     particles = min(count, PARTICLES)
     z, start = annealing.around(normal, particles, seed)
-    target = annealing.Joint(_target(fit), (_argument(fit.records),), normal.sites)
+    target = annealing.Joint(fit.model.collapsed, (_argument(fit.records),), normal.sites)
     with seeded(seed):
         annealed = annealing.anneal(z, start, target, seed=seed)
-        values = MappingProxyType(dict(annealing.values_of(normal.sites, annealed.z)))
+        values = MappingProxyType(normal.values_at(annealed.z))
     return PosteriorDraws(
         values,
         log_joint(fit, values),
@@ -170,7 +170,9 @@ def _of_normal(
 
 def log_joint(fit: Fit, values: Values) -> np.ndarray:
     """Log p(y, values) (S,) of draws, y the training records; -inf where it has no value."""
-    return log_joint_of(_target(fit), (_argument(fit.records),), values, _samples(fit.records))
+    return log_joint_of(
+        fit.model.collapsed, (_argument(fit.records),), values, _samples(fit.records)
+    )
 
 
 def log_joint_of(
@@ -207,27 +209,20 @@ def _portion(model: Any, args: tuple[Any, ...], values: Values) -> np.ndarray:
         each = [_portion(model, args, {k: v[i : i + 1] for k, v in values.items()}) for i in
                 range(count)]  # fmt: skip
         return np.concatenate(each)
-    total = np.zeros(count)
     for name, node in trace.nodes.items():
-        if node["type"] != "sample" or type(node["fn"]).__name__ == "_Subsample":
-            continue
-        if not node["is_observed"] and name not in values:
+        latent = node["type"] == "sample" and not node["is_observed"] and name not in values
+        if latent and type(node["fn"]).__name__ != "_Subsample":
             raise invalid("values", expected=f"draws of every site, {name!r} too", got="none of it")
-        log_prob = node["log_prob"].numpy()
-        if log_prob.ndim and log_prob.shape[0] == count:
-            total += log_prob.reshape(count, -1).sum(1)
-        else:
-            total += log_prob.sum()
+    total = log_prob_by_draw(trace, count).numpy()
     return np.where(np.isfinite(total), total, -np.inf)
 
 
-def at(fit: Fit, draws: PosteriorDraws) -> Fit:
-    """The fit with other draws: predictions from it are those of the draws."""
-    return replace(fit, draws=draws.values, method="svi", posterior=None, log_q_sites={})
+def with_draws(fit: Fit, values: Values) -> Fit:
+    """The fit with other draws, for what is computed from draws alone.
 
-
-def _target(fit: Fit) -> Any:
-    return fit.model.collapsed if isinstance(fit.model, Cascade) else fit.model
+    What it says of its own guide's draws (`log_q_sites`) stays: whether trajectories were sites.
+    """
+    return replace(fit, draws=values, posterior=None, trajectories={})
 
 
 def _argument(records: Sequence[Record]) -> Any:

@@ -26,7 +26,7 @@ from pyro_dynogp.criticism.site_densities import (
     measured,
 )
 from pyro_dynogp.criticism.site_dimensions import dimensions_for
-from pyro_dynogp.criticism.subjects import Subject, fingerprint_of
+from pyro_dynogp.criticism.subjects import Subject, fingerprint_of, no_refit
 from pyro_dynogp.parallel import seeded
 
 
@@ -128,11 +128,11 @@ class PyroPosterior:
 
     def fresh(self, record: int, first: int, last: int) -> np.ndarray:
         """Refused: how the model would begin elsewhere is for its author to say."""
-        raise _needs_refit()
+        raise no_refit()
 
     def without(self, left_out: np.ndarray) -> Subject:
         """Refused: how the posterior was found is for its author to say."""
-        raise _needs_refit()
+        raise no_refit()
 
     def to_arviz(self) -> Any:
         """ArviZ's InferenceData.
@@ -205,12 +205,3 @@ class PyroPosterior:
             found["log_q"] = Variable(self.draws.log_q, (), {"units": "nat"})
             attrs = pareto_attrs(self.draws)
         return dataset_of(found, {}, attrs, chains=self.chains)
-
-
-def _needs_refit() -> ValueError:
-    return invalid(
-        "target",
-        expected="one without refits for a model of your own",
-        got="one that fits again",
-        advice="Set refits=0 and look at Pareto's k, or fit to parts of the data yourself.",
-    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, Protocol
@@ -13,7 +13,13 @@ import torch
 
 from pyro_dynogp._errors import invalid
 from pyro_dynogp.criticism.densities import Kind, pointwise_log_density
-from pyro_dynogp.criticism.posterior_draws import AT_ONCE, PosteriorDraws, at, draws_of
+from pyro_dynogp.criticism.posterior_draws import (
+    AT_ONCE,
+    PosteriorDraws,
+    Values,
+    draws_of,
+    with_draws,
+)
 from pyro_dynogp.inference.refit import refit
 from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.collapsed import collapsed_of, outputs_with_gaps
@@ -97,29 +103,21 @@ class FitSubject:
         """Log-densities (S, N)."""
         parts = []
         for index, record in enumerate(self.records):
-            found = self._each(
-                record, lambda part, i=index, r=record: observed_of(part, r, i), kind, horizon
-            )
-            parts.append(found[:, ~record.missing])
+            parts.append(self._along(record, index, kind, horizon))
         return np.concatenate(parts, axis=1)
 
     def fresh(self, record: int, first: int, last: int) -> np.ndarray:
         """One-step log-densities (S, N') of a stretch whose first state is unknown."""
-        own = self.records[record][first:last]
-        found = self._each(own, lambda part: observed_of(part, own, None), "forecast", 1)
-        return found[:, ~own.missing]
+        return self._along(self.records[record][first:last], None, "forecast", 1)
 
-    def _each(self, record: Record, observed: Any, kind: Kind, horizon: int) -> np.ndarray:
-        """Densities (S, n, n_y), as many draws at a time as memory allows."""
-        y = outputs_with_gaps(record)
-        portion = max(1, AT_ONCE // (len(record) * record.n_outputs))
-        parts = []
-        for first in range(0, len(self.draws), portion):
-            values = {k: v[first : first + portion] for k, v in self.draws.values.items()}
-            part = at(self.fit, replace(self.draws, values=values))
-            with torch.no_grad():
-                parts.append(pointwise_log_density(observed(part), y, kind, horizon=horizon))
-        return np.concatenate(parts)
+    def _along(self, record: Record, index: int | None, kind: Kind, horizon: int) -> np.ndarray:
+        """Densities of a record's measured samples."""
+
+        def observed(part: Fit) -> Any:
+            return observed_of(part, record, index)
+
+        found = densities_at(self.fit, self.draws.values, record, observed, kind, horizon)
+        return found[:, ~record.missing]
 
     def without(self, left_out: np.ndarray) -> FitSubject:
         """The same model fitted without some samples (N,)."""
@@ -135,6 +133,32 @@ class FitSubject:
         if all(one.missing.all() for one in rest):
             raise invalid("record", expected="samples left to fit to", got="none")
         return replace(self, fit=refit(self.fit, rest))
+
+
+def densities_at(
+    fit: Fit,
+    values: Values,
+    record: Record,
+    observed: Callable[[Fit], Any],
+    kind: Kind,
+    horizon: int = 1,
+) -> np.ndarray:
+    """Log-densities (S, n, n_y) at draws, as many of them at a time as memory allows.
+
+    Args:
+        fit: the fit. values: (S, *shape) of its sites. record: whose outputs.
+        observed: distribution of the outputs, of the fit with some of the draws.
+        kind, horizon: see `pointwise_log_density`.
+    """
+    y = outputs_with_gaps(record)
+    count = len(next(iter(values.values())))
+    portion = max(1, AT_ONCE // (len(record) * record.n_outputs))
+    parts = []
+    for first in range(0, count, portion):
+        some = with_draws(fit, {k: v[first : first + portion] for k, v in values.items()})
+        with torch.no_grad():
+            parts.append(pointwise_log_density(observed(some), y, kind, horizon=horizon))
+    return np.concatenate(parts)
 
 
 def observed_of(fit: Fit, record: Record, index: int | None) -> Any:
@@ -186,14 +210,15 @@ class ArraySubject:
 
     def fresh(self, record: int, first: int, last: int) -> np.ndarray:
         """Not known."""
-        raise _no_refit()
+        raise no_refit()
 
     def without(self, left_out: np.ndarray) -> Subject:
         """Not known."""
-        raise _no_refit()
+        raise no_refit()
 
 
-def _no_refit() -> ValueError:
+def no_refit() -> ValueError:
+    """For a model whose author alone knows how it was fitted."""
     return invalid(
         "target",
         expected="one without refits for a model of your own",

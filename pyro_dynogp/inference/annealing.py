@@ -12,7 +12,7 @@ compiled recursions do.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -24,7 +24,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from pyro_dynogp.inference.guides import GaussianGuide
-from pyro_dynogp.inference.potential import Site, parts
+from pyro_dynogp.inference.potential import Site, log_prob_by_draw, parts
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
 
 # Effective share of particles after a step; Hamiltonian moves at each temperature, and at the end.
@@ -90,13 +90,7 @@ class Joint:
         conditioned = pyro.poutine.condition(self.model, data=values)
         trace = pyro.poutine.trace(conditioned).get_trace(*self.args)
         trace.compute_log_prob()
-        for node in trace.nodes.values():
-            if node["type"] == "sample":
-                log_prob = node["log_prob"]
-                total = total + (
-                    log_prob.reshape(len(z), -1).sum(1) if log_prob.dim() else log_prob
-                )
-        return total
+        return total + log_prob_by_draw(trace, len(z))
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,8 +293,3 @@ def around(guide: GaussianGuide, count: int, seed: int) -> tuple[Tensor, Student
     squares = torch.randn(count, int(FREEDOM), generator=generator, dtype=torch.float64)
     spread = (FREEDOM / squares.square().sum(-1, keepdim=True)).sqrt()
     return guide.loc + spread * (normal @ guide.scale_tril.mT), student
-
-
-def values_of(sites: Sequence[Site], z: Tensor) -> Mapping[str, Tensor]:
-    """Constrained values (S, *shape) of every site."""
-    return {site.name: site.transform(part) for site, part in parts(sites, z)}

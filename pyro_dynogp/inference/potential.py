@@ -37,6 +37,21 @@ def parts(sites: Sequence[Site], z: Tensor) -> Iterator[tuple[Site, Tensor]]:
         start = stop
 
 
+def log_prob_by_draw(trace: Any, count: int) -> Tensor:
+    """Log-density (S,) of all sites of a trace, run at S draws at once and scored.
+
+    A site that no draw changes has one density for all of them.
+    """
+    total = torch.zeros(count, dtype=torch.float64)
+    for node in trace.nodes.values():
+        if node["type"] != "sample" or type(node["fn"]).__name__ == "_Subsample":
+            continue
+        log_prob = node["log_prob"]
+        several = log_prob.dim() > 0 and log_prob.shape[0] == count
+        total = total + (log_prob.reshape(count, -1).sum(1) if several else log_prob.sum())
+    return total
+
+
 class Potential:
     """Sites of a model given its arguments, and its log joint density.
 

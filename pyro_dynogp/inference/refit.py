@@ -50,7 +50,7 @@ def refit(fit: Fit, records: Record | Sequence[Record]) -> Fit:
         )
     if len(several) != len(fit.records):
         raise invalid("records", expected=f"{len(fit.records)}, as before", got=str(len(several)))
-    target: Any = fit.model.collapsed if isinstance(fit.model, Cascade) else fit.model
+    target: Any = fit.model.collapsed
     argument = several[0] if len(several) == 1 else several
     cascade = isinstance(fit.model, Cascade)
     optima = maximise(

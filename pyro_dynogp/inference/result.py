@@ -102,9 +102,7 @@ class Fit:
         return self._system_at(self.draws)
 
     def _system_at(self, values: Mapping[str, Tensor]) -> Any:
-        model = self.model
-        if isinstance(model, Cascade):
-            model = model.collapsed  # parameters alone, no trajectories
+        model = self.model.collapsed  # parameters alone, no trajectories
         sample = pyro.poutine.condition(model.sample_system, data=dict(values))
         with torch.no_grad(), pyro.poutine.block():
             return sample(self.scaling)
@@ -179,10 +177,7 @@ class Fit:
 
     def log_joint(self, records: Record | Sequence[Record]) -> float:
         """Log p(y, mode): of the records with the sites at the mode."""
-        model = self.model
-        if isinstance(model, Cascade):
-            model = model.collapsed
-        conditioned = pyro.poutine.condition(model, data=dict(self.mode))
+        conditioned = pyro.poutine.condition(self.model.collapsed, data=dict(self.mode))
         with torch.no_grad():
             return float(pyro.poutine.trace(conditioned).get_trace(records).log_prob_sum())
 

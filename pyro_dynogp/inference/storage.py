@@ -242,8 +242,7 @@ def _sites(
     """The sites of the normal posterior in their order, without the training records."""
 
     def parameters() -> None:
-        target = model.collapsed if isinstance(model, Cascade) else model
-        target.sample_system(scaling)
+        model.collapsed.sample_system(scaling)
         for index in range(records):
             model.sample_states("" if records == 1 else f"_{index}")
 

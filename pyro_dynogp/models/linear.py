@@ -130,6 +130,11 @@ class LinearDynamicGP:
         return checked
 
     @property
+    def collapsed(self) -> LinearDynamicGP:
+        """The model with its trajectory integrated out, as it is: see `Cascade.collapsed`."""
+        return self
+
+    @property
     def several_outputs(self) -> bool:
         """Whether trajectories have an output dimension."""
         return self.outputs > 1

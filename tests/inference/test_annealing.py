@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import pyro_dynogp as dgp
-from pyro_dynogp.inference.annealing import Joint, Student, anneal, around, values_of
+from pyro_dynogp.inference.annealing import Joint, Student, anneal, around
 from pyro_dynogp.inference.guides import gaussian_guide
 from pyro_dynogp.inference.potential import Potential
 
@@ -135,7 +135,7 @@ def test_posterior_of_a_conjugate_model():
     guide = gaussian_guide(potential, loc, 0.6 * torch.eye(2, dtype=torch.float64))
     z, start = around(guide, 1500, 0)
     found = anneal(z, start, Joint(model, (), potential.sites))
-    values = values_of(potential.sites, found.z)
+    values = potential.unpack(found.z)
     n, lam = 5, 0.5
     mean = n * y.mean() / (n + lam)
     a = 3.0 + n / 2
