@@ -35,12 +35,13 @@ def linear_twin(model: Cascade, layer: Dynamic, scaling: Scaling) -> LinearDynam
     """The linear model whose optimum starts a dynamic layer."""
     return LinearDynamicGP(
         inputs=model.inputs,
+        direct=model.direct,
         outputs=layer.outputs if layer.outputs == model.outputs else 1,
         pairs=layer.pairs,
         noise=layer.noise,
         brownian=layer.brownian,
         feedthrough=layer.feedthrough,
-        process_noise=layer.process_noise or not model.inputs,
+        process_noise=layer.process_noise or model.inputs == model.direct,
         scaling=scaling,
     )
 
@@ -50,7 +51,7 @@ def leading_layers(model: Cascade) -> tuple[Wire, ...]:
     return tuple(
         one
         for one in model.wires
-        if isinstance(one.layer, Dynamic) and one.channels == model.inputs
+        if isinstance(one.layer, Dynamic) and one.channels == model.inputs - model.direct
     )
 
 
@@ -114,8 +115,15 @@ def starting_point(
     """
     generator = np.random.default_rng(plan.seed)
     values: Values = {}
-    signals = [{INPUTS: scaled_inputs(scaling, record)} for record in records]
+    inputs = [scaled_inputs(scaling, record) for record in records]
+    driving = model.inputs - model.direct
+    signals = [{INPUTS: u[:, :driving]} for u in inputs]
+    if model.direct:
+        values["direct"] = _direct(model, plan)
     targets = [_scaled_outputs(scaling, record) for record in records]
+    if model.direct:
+        added = [u[:, driving:] @ values["direct"].mT for u in inputs]
+        targets = [y - a for y, a in zip(targets, added, strict=True)]
     size = 1.0  # what signals below the leading layer were divided by
     level = torch.zeros(model.outputs, dtype=torch.float64)
     if plan.linear is not None:
@@ -167,6 +175,13 @@ def starting_point(
     return {name: value.detach().clone() for name, value in values.items()}
 
 
+def _direct(model: Cascade, plan: Plan) -> Tensor:
+    """Weights of direct inputs as the linear fit has them, where it has all outputs."""
+    shape = (model.outputs, model.direct)
+    found = None if plan.linear is None else plan.linear.get("direct")
+    return torch.zeros(shape, dtype=torch.float64) if found is None else found.expand(shape)
+
+
 def _linear_state(
     model: Cascade,
     one: Wire,
@@ -179,7 +194,9 @@ def _linear_state(
     assert isinstance(layer, Dynamic)
     if layer.outputs != model.outputs:
         return torch.zeros(2 * layer.pairs, dtype=torch.float64)
-    twin = Cascade(model.inputs, (layer,), initial_state="integrated", scaling=scaling)
+    twin = Cascade(
+        model.inputs, (layer,), direct=model.direct, initial_state="integrated", scaling=scaling
+    )
     with torch.no_grad(), pyro.poutine.block():
         system = pyro.poutine.condition(twin.sample_system, data=dict(linear))(scaling)
         assembly = assemble(system, time_grid(record.time), scaled_inputs(scaling, record))

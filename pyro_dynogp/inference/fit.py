@@ -25,7 +25,7 @@ from pyro_dynogp.inference.starts import starting_values
 from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.linear import LinearDynamicGP
 from pyro_dynogp.parallel import seeded
-from pyro_dynogp.record import Record, as_records
+from pyro_dynogp.record import Record
 
 __all__ = ["Fit", "fit"]
 
@@ -117,10 +117,9 @@ def fit(
         )
     if guide is not None and not cascade:
         raise invalid("guide", expected="None for a linear model, which is exact", got=repr(guide))
-    records = as_records(record)
-    model.check(records)
+    records = model.check(record)
     model = model.scaled_to(records)
-    argument = record if isinstance(record, Record) else records
+    argument = records[0] if isinstance(record, Record) else records
     kept = Checkpoints.at(
         checkpoint,
         model,

@@ -39,7 +39,7 @@ def starting_values(
     candidates = []
     for _ in range(tries):
         poles = random_poles(model.pairs, scaling, generator)
-        candidates.append(_given_poles(model, records, scaling, poles))
+        candidates.append(values_given_poles(model, records, scaling, poles))
     candidates.sort(key=lambda candidate: candidate[0])
     return [values for _, values in candidates[:count]]
 
@@ -53,18 +53,21 @@ def random_poles(pairs: int, scaling: Scaling, generator: np.random.Generator) -
     return rate * (-damping + 1j * np.sqrt(1.0 - damping**2))
 
 
-def _given_poles(
+def values_given_poles(
     model: LinearDynamicGP, records: Sequence[Record], scaling: Scaling, poles: np.ndarray
 ) -> tuple[float, dict[str, Tensor]]:
-    P, n_u, n_y = model.pairs, model.inputs, model.outputs
+    """Mean squared residual, and values of every site, for poles (P,) [1/time unit]."""
+    P, n_u, n_y = model.pairs, model.inputs - model.direct, model.outputs
     designs, targets = [], []
     for record in records:
         u = (record.inputs - scaling.input_offset) / scaling.input_scale
-        designs.append(_design(poles, record.time, u, model.feedthrough))
+        dynamic = _design(poles, record.time, u[:, :n_u], model.feedthrough)
+        designs.append(np.concatenate([u[:, n_u:], dynamic], axis=1))
         targets.append((record.outputs - scaling.output_offset) / scaling.output_scale)
     X, Y = np.concatenate(designs), np.concatenate(targets)
     weights = np.stack([_ridge(X, Y[:, a]) for a in range(n_y)])  # n_y, columns
     residual = Y - X @ weights.T
+    direct, weights = weights[:, : model.direct], weights[:, model.direct :]
     spread = np.nanstd(residual, axis=0)
     rate = np.abs(poles)
     gains = weights[:, : 2 * P * n_u].reshape(n_y, P, n_u, 2)
@@ -76,6 +79,8 @@ def _given_poles(
         "offset": weights[:, -1],
         "noise_sd": 0.7 * spread + 1e-3,
     }
+    if model.direct:
+        values["direct"] = direct
     direction = np.ones((n_y, P), dtype=complex)
     B = residues[0]
     if model.several_outputs:

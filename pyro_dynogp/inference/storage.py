@@ -18,6 +18,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from pyro_dynogp._errors import invalid
+from pyro_dynogp.channels import from_plain, to_plain
 from pyro_dynogp.inference.guides import GaussianGuide, MixtureGuide
 from pyro_dynogp.inference.potential import Potential
 from pyro_dynogp.layers.noise import Likelihood
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from pyro_dynogp.inference.result import Fit
 
 FORMAT = "pyro_dynogp.fit"
-VERSION = 3
+VERSION = 4
 # The models that a file may name: a file never decides what code is run.
 MODELS = {"Cascade": Cascade, "LinearDynamicGP": LinearDynamicGP}
 LAYERS: dict[str, type[Dynamic] | type[Static]] = {"Dynamic": Dynamic, "Static": Static}
@@ -128,6 +129,7 @@ def load(path: str | Path) -> Fit:
 def _options(model: LinearDynamicGP | Cascade) -> dict[str, Any]:
     """Everything that a model is made with but its scaling, as JSON has it."""
     options = {f.name: getattr(model, f.name) for f in fields(model) if f.name != "scaling"}
+    options["channels"] = [to_plain(channel) for channel in model.channels]
     if isinstance(model, Cascade):
         for one in model.wires:
             if isinstance(one.layer, Static) and one.layer.kernel is not None:
@@ -152,6 +154,7 @@ def _options(model: LinearDynamicGP | Cascade) -> dict[str, Any]:
 def _model(name: str, options: Mapping[str, Any], scaling: Scaling) -> LinearDynamicGP | Cascade:
     """Inverse of `_options`."""
     given = dict(options)
+    given["channels"] = tuple(from_plain(plain) for plain in given["channels"])
     if name == "Cascade":
         given["layers"] = tuple(_layer(layer) for layer in given["layers"])
         given["likelihood"] = Likelihood(**given["likelihood"])

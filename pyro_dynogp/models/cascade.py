@@ -14,6 +14,7 @@ from torch import Tensor
 
 from pyro_dynogp._errors import invalid
 from pyro_dynogp._tensors import as_tensor, broadcast
+from pyro_dynogp.channels import Channel
 from pyro_dynogp.distributions.process import LTIProcess
 from pyro_dynogp.layers.noise import Gaussian, Likelihood, Noise
 from pyro_dynogp.layers.static import StaticFunction, sample_static
@@ -21,9 +22,9 @@ from pyro_dynogp.lti.covariance import state_covariance
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.state import ModalState
 from pyro_dynogp.models.layers import INPUTS, Dynamic, Layer, Static, Wire, wire
-from pyro_dynogp.models.linear import initial_mean, past_input_covariance
-from pyro_dynogp.models.priors import FLAT, PriorName, TimeScale, sample_modes
-from pyro_dynogp.record import Record, as_records
+from pyro_dynogp.models.linear import check_direct, initial_mean, past_input_covariance, prepare
+from pyro_dynogp.models.priors import FLAT, PriorName, TimeScale, sample_direct, sample_modes
+from pyro_dynogp.record import Record
 from pyro_dynogp.scaling import Scaling
 
 Integrate = Literal["none", "last", "all"]
@@ -85,12 +86,14 @@ class CascadeSystem:
     Attributes:
         wires: how they are connected. layers: a system for each wire.
         noise: measurement noise. offset: (*b, n_y), or None where a static layer comes last.
+        direct: (*b, n_y, K) weights of the last K inputs, which act on the output at once.
     """
 
     wires: tuple[Wire, ...]
     layers: tuple[DynamicSystem | StaticSystem, ...]
     noise: Noise
     offset: Tensor | None
+    direct: Tensor | None = None
 
     @cached_property
     def batch_shape(self) -> torch.Size:
@@ -98,6 +101,8 @@ class CascadeSystem:
         shapes = [self.noise.batch_shape]
         if self.offset is not None:
             shapes.append(self.offset.shape[:-1])
+        if self.direct is not None:
+            shapes.append(self.direct.shape[:-2])
         for layer in self.layers:
             if isinstance(layer, DynamicSystem):
                 shapes.append(layer.modes.batch_shape)
@@ -106,6 +111,18 @@ class CascadeSystem:
             else:
                 shapes.append(layer.function.batch_shape)
         return broadcast(*shapes)
+
+    def driving(self, inputs: Tensor) -> Tensor:
+        """What the layers see of scaled inputs (*b, n, n_u): all but those that act at once."""
+        return inputs if self.direct is None else inputs[..., : -self.direct.shape[-1]]
+
+    def level(self, inputs: Tensor) -> Tensor | None:
+        """What is added to the last layer's output: offset and direct inputs (*b, n or 1, n_y)."""
+        level = None if self.offset is None else self.offset.unsqueeze(-2)
+        if self.direct is None:
+            return level
+        direct = inputs[..., -self.direct.shape[-1] :] @ self.direct.mT
+        return direct if level is None else level + direct
 
     def after(self, states: Mapping[str, Tensor]) -> CascadeSystem:
         """The cascade after past inputs, given by standard normal numbers (*b, 2P) by layer."""
@@ -143,10 +160,11 @@ class Cascade:
     conditional given the inducing values; below a dynamic layer one function along the path, which
     ``f_residual`` completes (`pyro.deterministic`). ``offset`` (n_y,) where a dynamic layer comes
     last; the likelihood's sites; ``y``. With several records trajectories and outputs are numbered
-    (``g_0``, ``y_0``, ...).
+    (``g_0``, ``y_0``, ...). ``direct`` (n_y, K) for inputs that act at once.
 
     Args:
-        inputs: n_u. layers: `Dynamic` and `Static` layers, first to last.
+        inputs: n_u, those that channels make included.
+        layers: `Dynamic` and `Static` layers, first to last.
         likelihood: `Gaussian()`, `StudentT(...)` or `Heteroscedastic(...)`.
         initial_state: "site": what past inputs left in a layer that a static layer sees is a site,
             ``g_initial_state`` (2P,), standard normal; in layers from which on all is linear it is
@@ -156,6 +174,7 @@ class Cascade:
         integrate: "none" keeps every trajectory as a site; "last" integrates a dynamic last layer
             under Gaussian noise, exactly; "all" integrates all trajectories by the moment-matching
             filter, exactly where the layers are linear.
+        direct, channels: as of `LinearDynamicGP`; the layers do not see direct inputs.
         scaling: learnt by `fit` from the training record; else from the record at hand.
 
     Raises:
@@ -168,6 +187,8 @@ class Cascade:
     initial_state: Literal["site", "integrated", "zero"] = "site"
     integrate: Integrate = "none"
     priors: PriorName = "default"
+    direct: int = 0
+    channels: tuple[Channel, ...] = ()
     scaling: Scaling | None = None
 
     def __post_init__(self) -> None:
@@ -190,15 +211,16 @@ class Cascade:
                 expected="'site', 'integrated' or 'zero'",
                 got=repr(self.initial_state),
             )
-        object.__setattr__(self, "_wires", wire(self.inputs, self.layers))
+        check_direct(self.inputs, self.direct, self.channels)
+        object.__setattr__(self, "_wires", wire(self.inputs - self.direct, self.layers))
         last = self.layers[-1]
         if self.integrate == "last" and not (
-            isinstance(last, Dynamic) and self.likelihood == Gaussian()
+            isinstance(last, Dynamic) and self.likelihood == Gaussian() and not self.direct
         ):
             raise invalid(
                 "integrate",
                 expected="'none' or 'all': only a dynamic last layer under constant Gaussian "
-                "noise can be integrated by itself",
+                "noise and without direct inputs can be integrated by itself",
                 got="'last'",
             )
 
@@ -242,7 +264,7 @@ class Cascade:
 
     def scaled_to(self, records: Record | Sequence[Record]) -> Cascade:
         """The same model with the scaling of the given training record(s)."""
-        return replace(self, scaling=Scaling.from_records(records))
+        return replace(self, scaling=Scaling.from_records(prepare(self, records)))
 
     def check(self, records: Record | Sequence[Record]) -> tuple[Record, ...]:
         """Records whose channels and units fit the model.
@@ -267,8 +289,9 @@ class Cascade:
             zero = torch.zeros(self.outputs, dtype=torch.float64)
             spread = FLAT if flat else 1.0
             offset = pyro.sample("offset", dist.Normal(zero, zero + spread).to_event(1))
-        noise = self.likelihood.sample(self.outputs, self.inputs, flat=flat)
-        return CascadeSystem(self.wires, tuple(systems), noise, offset)
+        noise = self.likelihood.sample(self.outputs, self.inputs - self.direct, flat=flat)
+        direct = sample_direct(self.direct, self.outputs, flat=flat) if self.direct else None
+        return CascadeSystem(self.wires, tuple(systems), noise, offset, direct)
 
     def _sample_dynamic(self, one: Wire, layer: Dynamic, time_scale: TimeScale) -> DynamicSystem:
         modes = sample_modes(
@@ -305,7 +328,7 @@ class Cascade:
     def __call__(self, records: Record | Sequence[Record]) -> None:
         """Run the Pyro model on one record or on several."""
         checked = self.check(records)
-        scaling = self.scaling or Scaling.from_records(records)
+        scaling = self.scaling or Scaling.from_records(checked)
         system = self.sample_system(scaling)
         for index, record in enumerate(checked):
             suffix = "" if len(checked) == 1 else f"_{index}"
@@ -346,7 +369,7 @@ class Cascade:
         inputs = scaled_inputs(scaling, record)
         y, missing = outputs_of(record)
         scale, shift = as_tensor(scaling.output_scale), as_tensor(scaling.output_offset)
-        signals = {INPUTS: inputs}
+        signals = {INPUTS: system.driving(inputs)}
         for one, layer in zip(system.wires, system.layers, strict=True):
             x = see(signals, one)
             if isinstance(layer, DynamicSystem):
@@ -360,9 +383,10 @@ class Cascade:
             else:
                 signals[one.name] = self._static(one, layer, x, suffix)
         mean = signals[system.wires[-1].name]
-        if system.offset is not None:
-            mean = mean + system.offset.unsqueeze(-2)
-        mean, sd = shift + scale * mean, scale * system.noise.sd(inputs)
+        level = system.level(inputs)
+        if level is not None:
+            mean = mean + level
+        mean, sd = shift + scale * mean, scale * system.noise.sd(system.driving(inputs))
         if not self.several_outputs:
             mean, sd = mean.squeeze(-1), sd.squeeze(-1)
         noise = system.noise.distribution(mean, sd, missing)
@@ -457,8 +481,8 @@ def observe_linear(
 
 
 def check_records(model: Any, records: Record | Sequence[Record]) -> tuple[Record, ...]:
-    """Records whose channels and units fit a model with inputs, outputs and scaling."""
-    checked = as_records(records)
+    """Records, prepared, whose channels and units fit a model with inputs, outputs and scaling."""
+    checked = prepare(model, records)
     for record in checked:
         for what, expected, got in (
             ("inputs", model.inputs, record.n_inputs),

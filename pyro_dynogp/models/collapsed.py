@@ -137,7 +137,9 @@ class _Assembler:
         self.batch = system.batch_shape
         self.states = count_states(system)
         self.total = self.states + count_outputs(system.wires)
-        self.signals = {INPUTS: Signal(inputs, None, (KNOWN,) * inputs.shape[-1])}
+        driving = system.driving(inputs)
+        self.level = system.level(inputs)
+        self.signals = {INPUTS: Signal(driving, None, (KNOWN,) * driving.shape[-1])}
         self.blocks: list[Block] = []
         self.modes: list[Modes] = []
         self.gains: list[Tensor] = []  # (*b, m, P, E) complex, held static outputs to modal state
@@ -252,8 +254,8 @@ class _Assembler:
         output = self.signals[self.system.wires[-1].name]
         n, n_y = len(self.grid), output.known.shape[-1]
         offset = output.known
-        if self.system.offset is not None:
-            offset = offset + self.system.offset.unsqueeze(-2)
+        if self.level is not None:
+            offset = offset + self.level
         H = output.rows
         if H is None:
             H = torch.zeros(n_y, self.total, dtype=torch.float64)
@@ -313,7 +315,7 @@ def assemble(
             walk.signals[one.name] = walk.dynamic(one, layer)
         else:
             walk.signals[one.name] = walk.static(one, layer)
-    return walk.finish(system.noise.sd(inputs))
+    return walk.finish(system.noise.sd(system.driving(inputs)))
 
 
 def step_noises(modes: Modes, steps: Tensor) -> Tensor:

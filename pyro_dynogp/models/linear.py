@@ -14,11 +14,12 @@ from torch import Tensor
 
 from pyro_dynogp._errors import invalid
 from pyro_dynogp._tensors import as_tensor
+from pyro_dynogp.channels import Channel, count_direct, prepared
 from pyro_dynogp.distributions.process import LTIProcess
 from pyro_dynogp.lti.covariance import real_covariance, state_covariance
 from pyro_dynogp.lti.modes import Modes, NoiseStructure
 from pyro_dynogp.lti.state import ModalState
-from pyro_dynogp.models.priors import FLAT, PriorName, TimeScale, sample_modes
+from pyro_dynogp.models.priors import FLAT, PriorName, TimeScale, sample_direct, sample_modes
 from pyro_dynogp.record import Record, as_records
 from pyro_dynogp.scaling import Scaling
 
@@ -53,10 +54,12 @@ class LinearDynamicGP:
 
     Sites: those of `sample_modes` under the prefix ``g``, ``offset`` and ``noise_sd`` (n_y,) in
     standard deviations of the training output (normal(0, 1) and log-normal around 0.1), and with
-    ``initial_state="site"`` ``initial_state`` (2P,), standard normal.
+    ``initial_state="site"`` ``initial_state`` (2P,), standard normal; ``direct`` (n_y, K) for
+    inputs that act at once.
 
     Args:
-        inputs: n_u, may be 0. outputs: n_y. pairs: P, the number of conjugate pairs (order 2P).
+        inputs: n_u, may be 0, those that channels make included. outputs: n_y.
+        pairs: P, the number of conjugate pairs (order 2P).
         noise: "shared" (one set of Brownian motions drives all pairs) or "independent".
         brownian: n_l, number of Brownian motions; by default n_y.
         feedthrough: whether the input acts on the output at once.
@@ -64,6 +67,9 @@ class LinearDynamicGP:
         initial_state: "integrated", what unknown past inputs of one standard deviation and past
             process noise would have left, a Gaussian, integrated out; "zero" (but for the past
             process noise); or "site", sampled.
+        direct: the last K inputs act on the output at once and without dynamics (trends, steps,
+            calendars): their weights are the site ``direct``, normal(0, 1) in standard deviations.
+        channels: made from each record before the model sees it, see `pyro_dynogp.channels`.
         priors: "default", or "paper" for flat ones but for the horseshoe on the noise gains: fit
             with them, but do not sample from them, their draws exceed floating-point range.
         scaling: what one time step and one standard deviation are; learnt by `fit` from the
@@ -81,6 +87,8 @@ class LinearDynamicGP:
     feedthrough: bool = True
     process_noise: bool = True
     initial_state: InitialState = "integrated"
+    direct: int = 0
+    channels: tuple[Channel, ...] = ()
     priors: PriorName = "default"
     scaling: Scaling | None = None
 
@@ -99,20 +107,21 @@ class LinearDynamicGP:
             raise invalid("noise", expected="'shared' or 'independent'", got=repr(self.noise))
         if self.priors not in ("default", "paper"):
             raise invalid("priors", expected="'default' or 'paper'", got=repr(self.priors))
+        check_direct(self.inputs, self.direct, self.channels)
         if self.inputs == 0 and not self.process_noise:
             raise invalid("process_noise", expected="True for a system without inputs", got="False")
 
     def scaled_to(self, records: Record | Sequence[Record]) -> LinearDynamicGP:
         """The same model with the scaling of the given training record(s)."""
-        return replace(self, scaling=Scaling.from_records(records))
+        return replace(self, scaling=Scaling.from_records(prepare(self, records)))
 
     def check(self, records: Record | Sequence[Record]) -> tuple[Record, ...]:
-        """Records whose channels and units fit the model.
+        """Records prepared with the model's channels, whose channels and units fit the model.
 
         Raises:
             ValueError: where the number of channels or a unit differs.
         """
-        checked = as_records(records)
+        checked = prepare(self, records)
         for record in checked:
             for what, expected, got in (
                 ("inputs", self.inputs, record.n_inputs),
@@ -146,7 +155,7 @@ class LinearDynamicGP:
         time_scale = TimeScale.of(scaling)
         modes = sample_modes(
             "g",
-            inputs=self.inputs,
+            inputs=self.inputs - self.direct,
             pairs=self.pairs,
             outputs=n_y if several else None,
             brownian=self.brownian or n_y,
@@ -157,6 +166,8 @@ class LinearDynamicGP:
             priors=self.priors,
         )
         flat = self.priors == "paper"
+        if self.direct:
+            modes = with_direct(modes, sample_direct(self.direct, n_y, flat=flat))
         zero = torch.zeros(n_y, dtype=torch.float64)
         offset = pyro.sample(
             "offset", dist.Normal(zero, zero + (FLAT if flat else 1.0)).to_event(1)
@@ -218,7 +229,7 @@ class LinearDynamicGP:
         """Run the Pyro model on one record or on several."""
         checked = self.check(records)
         single = len(checked) == 1
-        scaling = self.scaling or Scaling.from_records(records)
+        scaling = self.scaling or Scaling.from_records(checked)
         system = self.sample_system(scaling)
         for index, record in enumerate(checked):
             suffix = "" if single else f"_{index}"
@@ -235,6 +246,35 @@ class LinearDynamicGP:
                 process.observed(system.noise_sd),
                 obs=outputs if record.n_outputs else None,
             )
+
+
+def prepare(model: Any, records: Record | Sequence[Record]) -> tuple[Record, ...]:
+    """Records with the channels that a model makes from them."""
+    return tuple(prepared(record, model.channels) for record in as_records(records))
+
+
+def check_direct(inputs: int, direct: int, channels: Sequence[Channel]) -> None:
+    """Whether so many inputs can act directly.
+
+    Raises:
+        ValueError: where they are more than the inputs, or fewer than direct channels make.
+    """
+    least = count_direct(channels)
+    if not isinstance(direct, int) or not least <= direct <= inputs:
+        raise invalid(
+            "direct", expected=f"a whole number from {least} to {inputs}", got=repr(direct)
+        )
+
+
+def with_direct(modes: Modes, weights: Tensor) -> Modes:
+    """The system with more inputs, which act on the output alone: weights (*b, n_y, K)."""
+    B, D = modes.B, modes.D
+    silent = torch.zeros((*B.shape[:-1], weights.shape[-1]), dtype=B.dtype)
+    batch = torch.broadcast_shapes(D.shape[:-1], weights.shape[:-1])
+    joined = torch.cat([one.expand((*batch, one.shape[-1])) for one in (D, weights)], -1)
+    if not modes.several_outputs:
+        joined = joined.squeeze(-2)
+    return replace(modes, input_gain=torch.cat([B, silent], -1), feedthrough=joined)
 
 
 def past_input_covariance(modes: Modes, memory: float) -> Tensor:

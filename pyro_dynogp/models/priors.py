@@ -221,6 +221,11 @@ def sample_modes(
     return Modes(poles=poles, input_gain=B, output_gain=c, noise_gain=L, feedthrough=D, noise=noise)
 
 
+def sample_direct(columns: int, outputs: int, *, flat: bool = False) -> Tensor:
+    """Weights (*b, n_y, K) of inputs that act on the output at once, site ``direct``."""
+    return pyro.sample("direct", _normal(FLAT if flat else 1.0, outputs, columns))
+
+
 def _section(poles: Tensor, gain: Tensor) -> Tensor:
     """(g1, g0) to the numerator (g1, g0 |lambda|)."""
     size = poles.abs().unsqueeze(-1)

@@ -19,7 +19,7 @@ from pyro_dynogp.moments import recursion, smoothing
 from pyro_dynogp.moments.problem import FilterProblem, each
 from pyro_dynogp.parallel import seeded
 from pyro_dynogp.prediction.beginning import beginning, cascade_of
-from pyro_dynogp.prediction.clock import gap_between
+from pyro_dynogp.prediction.clock import following, gap_between, one_record
 from pyro_dynogp.prediction.prediction import Prediction
 from pyro_dynogp.prediction.sampling import (
     Drawn,
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 def simulate(fit: Fit, record: Record, process_noise: bool, samples: int, seed: int) -> Prediction:
     """See `Fit.simulate`."""
-    _one(fit, record)
+    record = one_record(fit, record)
     with torch.no_grad():
         system = cascade_of(fit).begin(fit.system, {})
         inputs = scaled_inputs(fit.scaling, record)
@@ -52,8 +52,7 @@ def forecast(
     fit: Fit, past: Record, future: Record, process_noise: bool, samples: int, seed: int
 ) -> Prediction:
     """See `Fit.forecast`."""
-    _one(fit, past)
-    _one(fit, future)
+    past, future = following(fit, past, future)
     gap = gap_between(past, future)
     if not past.n_outputs:
         raise invalid("past", expected="outputs to start from", got="none")
@@ -84,7 +83,7 @@ def filtered_state(assembly: Assembly, y: Tensor) -> JointState:
 
 def predict(fit: Fit, record: Record, horizon: int, samples: int, seed: int) -> Prediction:
     """See `Fit.predict`."""
-    _one(fit, record)
+    record = one_record(fit, record)
     if not isinstance(horizon, int) or horizon < 1:
         raise invalid("horizon", expected="a whole number >= 1", got=repr(horizon))
     if not record.n_outputs:
@@ -139,7 +138,7 @@ class LayerTrajectory:
 
 def layers(fit: Fit, record: Record) -> dict[str, LayerTrajectory]:
     """Smoothed trajectories of all layers given a record's inputs and outputs."""
-    _one(fit, record)
+    record = one_record(fit, record)
     with torch.no_grad():
         inputs = scaled_inputs(fit.scaling, record)
         assembly = assemble(beginning(fit, record), time_grid(record.time), inputs)
@@ -218,8 +217,9 @@ def static_function(fit: Fit, name: str, record: Record, channel: int, points: i
     one = wires[name]
     if not 0 <= channel < one.channels:
         raise invalid("channel", expected=f"0 to {one.channels - 1}", got=repr(channel))
+    record = one_record(fit, record)
     found = {k: v.mean for k, v in layers(fit, record).items()}
-    found["inputs"] = scaled_inputs(fit.scaling, record).numpy()
+    found["inputs"] = fit.system.driving(scaled_inputs(fit.scaling, record)).numpy()
     seen = np.concatenate([found[source] for source in one.sources], -1)
     low, high = seen[:, channel].min(), seen[:, channel].max()
     margin = 0.1 * (high - low)
@@ -270,8 +270,9 @@ def _forward(
     last = system.wires[-1].name
     drawn = mean
     if isinstance(system.layers[-1], DynamicSystem):
-        level = 0.0 if system.offset is None else system.offset.unsqueeze(-2)
-        drawn = shift + scale * _flat(full.signals[last] + level)
+        level = system.level(inputs)
+        signal = full.signals[last]
+        drawn = shift + scale * _flat(signal if level is None else signal + level)
 
     def draw() -> np.ndarray:
         own = np.zeros_like(variance) if drawn is not mean else variance
@@ -324,7 +325,7 @@ def _noise_variance(
     system: CascadeSystem, inputs: Tensor, count: int, generator: np.random.Generator
 ) -> np.ndarray:
     """Variance (count, n, n_y) of the noise for each component; a Student-t's is drawn."""
-    sd = system.noise.sd(inputs)
+    sd = system.noise.sd(system.driving(inputs))
     flat = sd.reshape(-1, *sd.shape[-2:]).numpy()
     variance = np.broadcast_to(flat, (len(flat), *flat.shape[1:])) ** 2
     variance = np.tile(variance, (-(-count // len(variance)), 1, 1))[:count]
@@ -341,17 +342,6 @@ def _units(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
 def _scaled(fit: Fit, record: Record) -> Tensor:
     scale, shift = _units(fit)
     return torch.tensor((record.outputs - shift) / scale, dtype=torch.float64)
-
-
-def _one(fit: Fit, record: Record) -> None:
-    if not isinstance(record, Record):
-        raise invalid(
-            "record",
-            expected="one Record",
-            got=type(record).__name__,
-            advice="Predict several records one after the other.",
-        )
-    fit.model.check(record)
 
 
 Layers = Mapping[str, LayerTrajectory]

@@ -1,9 +1,60 @@
-"""The time between two records."""
+"""Records that a prediction is made from: checked, prepared, one after the other."""
 
 from __future__ import annotations
 
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+
 from pyro_dynogp._errors import invalid
 from pyro_dynogp.record import Record
+
+if TYPE_CHECKING:
+    from pyro_dynogp.inference.result import Fit
+
+
+def one_record(fit: Fit, record: Record) -> Record:
+    """A record prepared with the channels of the model.
+
+    Raises:
+        ValueError: where it is no single record, or does not fit the model.
+    """
+    if not isinstance(record, Record):
+        raise invalid(
+            "record",
+            expected="one Record",
+            got=type(record).__name__,
+            advice="Predict several records one after the other.",
+        )
+    return fit.model.check(record)[0]
+
+
+def following(fit: Fit, past: Record, future: Record) -> tuple[Record, Record]:
+    """Two records prepared together: a channel of the second may reach back into the first.
+
+    Raises:
+        ValueError: as `one_record` and `gap_between`.
+    """
+    gap = gap_between(past, future)
+    alone = one_record(fit, past), one_record(fit, future)
+    if not fit.model.channels or set(future.input_names) != set(past.input_names):
+        return alone
+    if alone[0].input_names == past.input_names:  # prepared before they were split
+        return alone
+    names = [name for name in past.extra if name in future.extra]
+    both = dataclasses.replace(
+        past,
+        time=np.concatenate([past.time, past.time[-1] + gap + future.time - future.time[0]]),
+        inputs=np.concatenate([past.inputs, future.inputs]),
+        outputs=np.zeros((len(past) + len(future), 0)),
+        output_names=(),
+        output_units=(),
+        extra={name: np.concatenate([past.extra[name], future.extra[name]]) for name in names},
+        extra_units={name: past.extra_units[name] for name in names},
+    )
+    inputs = fit.model.check(both)[0].inputs[len(past) :]
+    return alone[0], dataclasses.replace(alone[1], inputs=inputs)
 
 
 def gap_between(past: Record, future: Record) -> float:

@@ -138,7 +138,8 @@ def draw_layers(
     lead = random.state.shape[:-1]
     state = state.expand((*lead, state.shape[-1]))
     half = state.shape[-1] // 2
-    signals: dict[str, Tensor] = {INPUTS: inputs.expand(lead + inputs.shape[-2:])}
+    driving = system.driving(inputs)
+    signals: dict[str, Tensor] = {INPUTS: driving.expand(lead + driving.shape[-2:])}
     before = 0
     mean = signals[INPUTS]
     variance = torch.zeros(())
@@ -166,8 +167,9 @@ def draw_layers(
             if one.last:
                 value = mean
         signals[one.name] = value
-    if system.offset is not None:
-        mean = mean + system.offset.unsqueeze(-2)
+    level = system.level(inputs)
+    if level is not None:
+        mean = mean + level
     return Drawn(signals, mean, variance.expand(mean.shape))
 
 
@@ -266,9 +268,10 @@ def draw_outputs(system: CascadeSystem, time: Any, inputs: Tensor, shape: torch.
     on = Switches.all_on(system, several_channels=True)  # the model as it is stated
     drawn = draw_layers(system, grid, inputs, start, random, on)
     signal = drawn.signals[system.wires[-1].name]
-    if system.offset is not None:
-        signal = signal + system.offset.unsqueeze(-2)
+    if isinstance(system.layers[-1], DynamicSystem):
+        level = system.level(inputs)
+        signal = signal if level is None else signal + level
     else:
         signal = drawn.mean + drawn.variance.sqrt() * torch.randn_like(drawn.mean)
-    noise = system.noise.distribution(signal, system.noise.sd(inputs), None)
+    noise = system.noise.distribution(signal, system.noise.sd(system.driving(inputs)), None)
     return noise.sample()
