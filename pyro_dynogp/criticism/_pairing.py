@@ -108,7 +108,7 @@ def _check_times(prediction: Prediction, record: Record) -> None:
 
 
 def _note(kind: str) -> str:
-    steps = re.match(r"(\d+)-step prediction", kind)
+    steps = re.fullmatch(r"(\d+)-step prediction", kind)  # no word of joint errors
     if steps is None or int(steps[1]) == 1:
         return ""
     return (

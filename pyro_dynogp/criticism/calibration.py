@@ -178,9 +178,9 @@ def calibration(
     own curves; between these curves the measured one has to lie. So one mechanism serves
     independent one-step errors as well as the strongly dependent errors of a simulation. The
     p-values hold where the joint samples depend on each other in time as the measured outputs do
-    under the model; those of a prediction several steps ahead do not (see `Calibration.note`).
-    They hold for a record that the model was not fitted to; on the training record they are
-    larger than they should be, as the fit has seen the outputs.
+    under the model: those of a linear model do, those of a cascade's predictions several steps
+    ahead do not (see `Calibration.note`). They hold for a record that the model was not fitted to;
+    on the training record they are larger than they should be, as the fit has seen the outputs.
 
     Args:
         prediction: of the same times as the record, with 50 joint samples or more; at most 500 of

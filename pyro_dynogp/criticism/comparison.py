@@ -249,6 +249,8 @@ def mix(predictions: Sequence[Prediction], weights: np.ndarray) -> Prediction:
         else np.broadcast_to(one.noise_variance[:, None, :], one.component_mean.shape)
         for one in predictions
     ]
+    # Samples are joint where those of all models are, which the longer kind says.
+    kind = min((one.kind for one in predictions), key=len)
     return Prediction(
         first.time,
         first.output_names,
@@ -257,6 +259,6 @@ def mix(predictions: Sequence[Prediction], weights: np.ndarray) -> Prediction:
         np.concatenate(noise),
         parts,
         draw,
-        first.kind,
+        kind,
         component_weights,
     )

@@ -10,6 +10,7 @@ import numpy as np
 from pyro_dynogp._errors import invalid
 from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.left_out import Found, forecast, missing_sample, new_record
+from pyro_dynogp.criticism.posterior_draws import DRAWS
 from pyro_dynogp.criticism.subjects import FitSubject, Parameters, Subject
 from pyro_dynogp.record import Record, as_records
 
@@ -30,7 +31,7 @@ def loo(
     horizon: int = 1,
     begin: int | float = 0.5,
     folds: int = 5,
-    draws: int = 1000,
+    draws: int = DRAWS,
     parameters: Parameters = "posterior",
     refits: int = MOST_REFITS,
     seed: int = 0,
@@ -54,7 +55,8 @@ def loo(
         begin: of "forecast": first sample that is scored, a number of samples or a share of the
             record.
         folds: of "new record", contiguous blocks of a single record.
-        draws: of the posterior (of NUTS all).
+        draws: of the posterior (of NUTS all). They are kept with the fit: a second call, another
+            target and `check` take the same ones.
         parameters: "posterior", or "mode" for densities with all parameters at the mode, which has
             seen the data: O(n) and quick, and kind to models of many parameters. For records so
             long that parameters are all but known.
@@ -83,7 +85,7 @@ def loo(
         )
     if not isinstance(refits, int) or refits < 0:
         raise invalid("refits", expected="a whole number >= 0", got=repr(refits))
-    subject = subject_of(fit, record, draws, seed, parameters)
+    subject = subject_of(fit, record, draws, seed, parameters, progress)
     if target == "missing sample":
         found = missing_sample(subject, refits, workers, progress)
     elif target == "forecast":
@@ -99,6 +101,7 @@ def subject_of(
     draws: int,
     seed: int,
     parameters: Parameters = "posterior",
+    progress: bool = False,
 ) -> Subject:
     """What `loo` works on."""
     from pyro_dynogp.inference.result import Fit
@@ -121,7 +124,7 @@ def subject_of(
         )
     if parameters not in ("posterior", "mode"):
         raise invalid("parameters", expected="'posterior' or 'mode'", got=repr(parameters))
-    return FitSubject(fit, fit.records, draws, seed, parameters)
+    return FitSubject(fit, fit.records, draws, seed, parameters, progress)
 
 
 def _elpd(subject: Subject, found: Found, target: str, horizon: int) -> Any:

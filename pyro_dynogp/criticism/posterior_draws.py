@@ -15,6 +15,8 @@ from torch import Tensor
 
 from pyro_dynogp._errors import invalid
 from pyro_dynogp.criticism import arviz_bridge
+from pyro_dynogp.criticism.finding import apart
+from pyro_dynogp.criticism.kept_draws import kept
 from pyro_dynogp.inference import annealing
 from pyro_dynogp.inference.guides import GaussianGuide, MixtureGuide, gaussian_guide
 from pyro_dynogp.inference.potential import Potential, log_prob_by_draw
@@ -27,6 +29,8 @@ if TYPE_CHECKING:
     from pyro_dynogp.inference.result import Fit
 
 Values = Mapping[str, Tensor]
+# Draws that `check` and `loo` take where they are not told: the same, so that their k agree.
+DRAWS = 1000
 # Widest standard deviation of a Laplace approximation, in unconstrained units, where the density
 # is flat: priors are about as wide.
 WIDEST = 1.5
@@ -75,8 +79,10 @@ class PosteriorDraws:
         return out
 
 
-def draws_of(fit: Fit, *, count: int = 400, seed: int = 0, anneal: bool = True) -> PosteriorDraws:
-    """Draws of all parameters of a fit.
+def draws_of(
+    fit: Fit, *, count: int = DRAWS, seed: int = 0, anneal: bool = True, progress: bool = False
+) -> PosteriorDraws:
+    """Draws of all parameters of a fit, computed once and kept with it.
 
     NUTS: its draws. A variational posterior: fresh draws of it; of a cascade by default those of
     inducing values and first states, with all else at an optimum, whose own uncertainty then
@@ -87,7 +93,25 @@ def draws_of(fit: Fit, *, count: int = 400, seed: int = 0, anneal: bool = True) 
     Args:
         fit: the fit. count: number of draws S (of NUTS all there are). seed: for them.
         anneal: whether particles are annealed; False for the draws of the fit's own normal.
+        progress: whether annealing shows a bar.
+
+    Raises:
+        ValueError: where draws are to be annealed around the mode of a cascade.
     """
+    if anneal and fit.method != "nuts" and not isinstance(fit.posterior, MixtureGuide):
+        own = draws_of(fit, count=count, seed=seed, anneal=False)
+        if fit.log_q_sites:
+            return own
+        k = float(arviz_bridge.psis(own.log_ratio)[1])
+        if k <= arviz_bridge.good_k(count):
+            return own
+        key = ("annealed", count, seed)
+        return kept(fit, key, lambda: _annealed(fit, own, k, count, seed, progress))
+    return kept(fit, ("own", count, seed), lambda: _own(fit, count, seed))
+
+
+def _own(fit: Fit, count: int, seed: int) -> PosteriorDraws:
+    """Draws of what the fit holds itself."""
     if fit.method == "nuts":
         n = len(next(iter(fit.draws.values())))
         return PosteriorDraws(fit.draws, None, None, np.zeros(n, dtype=int), "NUTS")
@@ -101,12 +125,9 @@ def draws_of(fit: Fit, *, count: int = 400, seed: int = 0, anneal: bool = True) 
             np.zeros(len(log_q), dtype=int),
             "SVI with trajectories as sites",
         )
-    if isinstance(fit.posterior, GaussianGuide):
-        return _of_normal(fit, fit.posterior, count, seed, "SVI, multivariate normal", anneal)
     if isinstance(fit.posterior, MixtureGuide):
         return _of_optima(fit, fit.posterior, count, seed)
-    normal = laplace(fit, fit.mode)
-    return _of_normal(fit, normal, count, seed, "Laplace's approximation", anneal)
+    return _of_normal(fit, count, seed)
 
 
 def _of_optima(fit: Fit, guide: MixtureGuide, count: int, seed: int) -> PosteriorDraws:
@@ -130,41 +151,51 @@ def laplace(fit: Fit, values: Values) -> GaussianGuide:
     return gaussian_guide(potential, torch.as_tensor(centre), torch.as_tensor(root))
 
 
-def _of_normal(
-    fit: Fit, normal: GaussianGuide, count: int, seed: int, kind: str, anneal: bool
-) -> PosteriorDraws:
-    """Draws of a normal, or of the posterior where a normal will not do."""
+def normal_of(fit: Fit) -> GaussianGuide:
+    """The normal that a fit is: its variational posterior, or Laplace's around its mode."""
+    if isinstance(fit.posterior, GaussianGuide):
+        return fit.posterior
+    return kept(fit, "laplace", lambda: laplace(fit, fit.mode))
+
+
+def _of_normal(fit: Fit, count: int, seed: int) -> PosteriorDraws:
+    normal = normal_of(fit)
     with seeded(seed), torch.no_grad():
         noise = torch.randn(count, len(normal.loc), dtype=torch.float64)
         values = MappingProxyType(normal.values_at(normal.loc + noise @ normal.scale_tril.mT))
         log_q = normal.log_prob(values).numpy()
-    single = np.zeros(count, dtype=int)
-    drawn = PosteriorDraws(values, log_joint(fit, values), log_q, single, kind)
-    k = float(arviz_bridge.psis(drawn.log_ratio)[1])
-    if not anneal or k <= arviz_bridge.good_k(count):
-        return drawn
+    kind = "Laplace's approximation" if fit.posterior is None else "SVI, multivariate normal"
+    return PosteriorDraws(values, log_joint(fit, values), log_q, np.zeros(count, dtype=int), kind)
+
+
+def _annealed(
+    fit: Fit, own: PosteriorDraws, k: float, count: int, seed: int, progress: bool
+) -> PosteriorDraws:
+    """Draws of the posterior where the fit's own normal, of Pareto shape k, will not do."""
+    shape = apart(k, arviz_bridge.good_k(count))[0]
     if isinstance(fit.model, Cascade):  # annealing would take an hour
         if fit.method == "svi":
-            return drawn  # the posterior that was chosen; its k goes with every result
+            return own  # the posterior that was chosen; its k goes with every result
         raise invalid(
             "fit",
             expected="a posterior that can be drawn from",
-            got=f"a posterior mode around which Laplace's approximation is useless (k = {k:.2f})",
+            got=f"a posterior mode around which Laplace's approximation is useless (k = {shape})",
             advice="Fit with method='svi' (the default of cascades) or 'nuts', or use "
             "parameters='mode'.",
         )
+    normal = normal_of(fit)
     particles = min(count, PARTICLES)
     z, start = annealing.around(normal, particles, seed)
     target = annealing.Joint(fit.model.collapsed, (_argument(fit.records),), normal.sites)
     with seeded(seed):
-        annealed = annealing.anneal(z, start, target, seed=seed)
+        annealed = annealing.anneal(z, start, target, seed=seed, progress=progress)
         values = MappingProxyType(normal.values_at(annealed.z))
     return PosteriorDraws(
         values,
         log_joint(fit, values),
         None,
         np.zeros(particles, dtype=int),
-        f"annealed from {kind}, whose own Pareto k is {k:.2f}",
+        f"annealed from {own.kind}, whose own Pareto k is {shape}",
     )
 
 

@@ -115,7 +115,7 @@ def predictive_checks(
 
     On the record that the model was fitted to p-values are larger than they should be, since the
     fit has seen the outputs; use a simulation or a forecast of another record. Joint samples of a
-    prediction several steps ahead are independent in time and its errors are not (see
+    cascade's prediction several steps ahead are independent in time and its errors are not (see
     `PredictiveChecks.note`).
 
     Args:

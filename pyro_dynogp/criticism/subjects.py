@@ -23,8 +23,7 @@ from pyro_dynogp.criticism.posterior_draws import (
 from pyro_dynogp.inference.refit import refit
 from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.collapsed import collapsed_of, outputs_with_gaps
-from pyro_dynogp.models.linear import LinearDynamicGP, initial_mean
-from pyro_dynogp.prediction.linear import prior_process
+from pyro_dynogp.prediction.linear import prior_process, process_given
 from pyro_dynogp.record import Record
 
 if TYPE_CHECKING:
@@ -67,6 +66,7 @@ class FitSubject:
         fit: the fit; of `records`, or of less of them.
         records: where densities are evaluated. count, seed: of the draws.
         parameters: "posterior", or "mode" for the mode alone.
+        progress: whether drawing shows a bar where it takes long.
     """
 
     fit: Fit
@@ -74,14 +74,15 @@ class FitSubject:
     count: int
     seed: int
     parameters: Parameters = "posterior"
+    progress: bool = False
 
-    @cached_property
+    @property
     def draws(self) -> PosteriorDraws:
-        """Draws (S) of the posterior, or the mode as the only one."""
+        """Draws (S) of the posterior, kept with the fit, or the mode as the only one."""
         if self.parameters == "mode":
             values = {name: value.unsqueeze(0) for name, value in self.fit.mode.items()}
             return PosteriorDraws(values, None, None, np.zeros(1, dtype=int), "at the mode")
-        return draws_of(self.fit, count=self.count, seed=self.seed)
+        return draws_of(self.fit, count=self.count, seed=self.seed, progress=self.progress)
 
     @cached_property
     def places(self) -> Mapping[str, np.ndarray]:
@@ -132,7 +133,7 @@ class FitSubject:
             rest.append(record.with_outputs(y)[: max(there[-1] + 1 if len(there) else 0, 2)])
         if all(one.missing.all() for one in rest):
             raise invalid("record", expected="samples left to fit to", got="none")
-        return replace(self, fit=refit(self.fit, rest))
+        return replace(self, fit=refit(self.fit, rest), progress=False)
 
 
 def densities_at(
@@ -177,13 +178,9 @@ def observed_of(fit: Fit, record: Record, index: int | None) -> Any:
             names = {one.name: f"{one.name}_initial_state{suffix}" for one in model.state_sites}
             states = {layer: fit.draws[site] for layer, site in names.items()}
         return collapsed_of(model.begin(system, states), fit.scaling, record)
-    assert isinstance(model, LinearDynamicGP)
-    if model.initial_state == "site" and index is not None:
-        state = initial_mean(system.past_inputs, fit.draws[f"initial_state{suffix}"])
-        process = model.process(system, record, fit.scaling, state)
-    else:
-        process = prior_process(fit, record)
-    return process.observed(system.noise_sd)
+    if index is not None:
+        return process_given(fit, record, index).observed(system.noise_sd)
+    return prior_process(fit, record, unknown_start=True).observed(system.noise_sd)
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,6 +23,8 @@ from pyro_dynogp.parallel import parallel_map, seeded
 from pyro_dynogp.record import Record
 
 Optimizer = Literal["lbfgs", "adam"]
+# Adam's first step, and how often it goes back to the best point with a shorter one.
+RATE, RETURNS = 0.02, 2
 
 
 @dataclass(frozen=True)
@@ -52,9 +54,13 @@ class _Task:
     seed: int
     checkpoints: Checkpoints
     key: str
+    rate: float
 
 
-def _lbfgs(potential: Potential, z: np.ndarray, steps: int) -> tuple[np.ndarray, list, str]:
+def _lbfgs(
+    potential: Potential, z: np.ndarray, steps: int, rate: float
+) -> tuple[np.ndarray, list, str]:
+    del rate  # its line search finds the step
     history: list[float] = []
     result = minimize(
         potential.value_and_gradient,
@@ -67,15 +73,19 @@ def _lbfgs(potential: Potential, z: np.ndarray, steps: int) -> tuple[np.ndarray,
     return result.x, history, str(result.message)
 
 
-def _adam(potential: Potential, z: np.ndarray, steps: int) -> tuple[np.ndarray, list, str]:
-    x = torch.tensor(z, dtype=torch.float64, requires_grad=True)
-    optimizer = torch.optim.Adam([x], lr=0.02)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps, eta_min=1e-4)
+def _adam(
+    potential: Potential, z: np.ndarray, steps: int, rate: float
+) -> tuple[np.ndarray, list, str]:
+    """Adam with a falling step; back to the best point with a shorter one where it got lost.
+
+    Its first steps have full length in every direction, however good the start is.
+    """
+    x, optimizer, schedule = _from(z, rate, steps)
     history: list[float] = []
     best, best_z = np.inf, z
     patience = max(50, steps // 10)
-    since = 0
-    for _ in range(steps):
+    since, returns = 0, 0
+    for done in range(steps):
         here = x.detach().numpy().copy()
         value, gradient = potential.value_and_gradient(here)
         history.append(value)
@@ -85,11 +95,23 @@ def _adam(potential: Potential, z: np.ndarray, steps: int) -> tuple[np.ndarray, 
         if value < best:
             best, best_z = value, here
         if since > patience:
-            return best_z, history, "no improvement of 0.001 nats within the patience"
+            if returns == RETURNS:
+                return best_z, history, "no improvement of 0.001 nats within the patience"
+            returns, since, rate = returns + 1, 0, rate / 4.0
+            x, optimizer, schedule = _from(best_z, rate, steps - done)
+            continue
         x.grad = torch.tensor(gradient)
         optimizer.step()
         schedule.step()
     return best_z, history, "all steps used"
+
+
+def _from(z: np.ndarray, rate: float, steps: int) -> tuple[Tensor, Any, Any]:
+    """Adam at a point, with a step that falls over the steps that are left."""
+    x = torch.tensor(z, dtype=torch.float64, requires_grad=True)
+    optimizer = torch.optim.Adam([x], lr=rate)
+    low = min(1e-4, 0.1 * rate)
+    return x, optimizer, torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps, eta_min=low)
 
 
 _METHODS = {"lbfgs": _lbfgs, "adam": _adam}
@@ -104,7 +126,7 @@ def _climb(task: _Task) -> Optimum:
     with seeded(task.seed):
         potential = Potential(task.model, (task.records,), task.values)
         z = potential.pack(task.values).numpy()
-        z, history, message = _METHODS[task.optimizer](potential, z, task.steps)
+        z, history, message = _METHODS[task.optimizer](potential, z, task.steps, task.rate)
         energy = potential.value_and_gradient(z)[0]
         values = {k: v.detach() for k, v in potential.unpack(torch.tensor(z)).items()}
     return Optimum(energy, values, np.asarray(history), message)
@@ -139,12 +161,14 @@ def maximise(
     checkpoints: Checkpoints = NOTHING_KEPT,
     key: str = "optimum",
     kept: float = 1 / 3,
+    rate: float = RATE,
 ) -> list[Optimum]:
     """Climb from every start; the optima sorted by energy, best first.
 
     All starts get a fifth of the steps, then the best of them, the share `kept`, the rest
     (successive halving: a start that is far behind by then hardly ever wins). The mode is that of
-    the density of the constrained values (no Jacobian), as AutoDelta has it.
+    the density of the constrained values (no Jacobian), as AutoDelta has it. `rate` is Adam's
+    first step, in unconstrained units.
     """
 
     def climb(values: Sequence[dict[str, Tensor]], count: int, label: str) -> list[Optimum]:
@@ -158,6 +182,7 @@ def maximise(
                 seed,
                 checkpoints,
                 f"{key}-{label}-{i}",
+                rate,
             )
             for i, value in enumerate(values)
         ]

@@ -24,6 +24,8 @@ from pyro_dynogp.record import Record
 
 # Iterations from the old optimum: of L-BFGS, of Adam, of SVI for all sites.
 LINEAR_STEPS, CASCADE_STEPS, SVI_STEPS = 300, 200, 400
+# Adam's first step: the old optimum is close by.
+REFIT_RATE = 0.004
 # Of NUTS, whose chains start at the mode.
 WARMUP = 300
 
@@ -62,6 +64,7 @@ def refit(fit: Fit, records: Record | Sequence[Record]) -> Fit:
         seed=fit.seed,
         workers=1,
         kept=1.0,
+        rate=REFIT_RATE,
     )
     best = optima[0]
     changed: dict[str, Any] = {

@@ -216,8 +216,9 @@ class Fit:
     ) -> Prediction:
         """Each output from the inputs and from the outputs up to `horizon` samples before it.
 
-        Exact Kalman predictions. Samples of the result are independent from time to time, since
-        each time has its own data.
+        Exact Kalman predictions. Samples of a linear model are its mean plus errors with their
+        joint law over time (a moving average of `horizon` innovations on a regular record); those
+        of a cascade are independent from time to time.
         """
         return self._predictions.predict(self, record, horizon, samples, seed)
 

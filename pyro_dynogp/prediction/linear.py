@@ -11,18 +11,22 @@ from torch import Tensor
 
 from pyro_dynogp._errors import invalid
 from pyro_dynogp._tensors import as_tensor
-from pyro_dynogp.distributions.process import LTIProcess
+from pyro_dynogp.distributions.process import LTIProcess, ObservedLTIProcess
 from pyro_dynogp.distributions.trajectory import split_missing
 from pyro_dynogp.lti.filtering import predict_k_steps
+from pyro_dynogp.lti.semiseparable import SemiseparableCovariance
 from pyro_dynogp.lti.state import ModalState, propagate
-from pyro_dynogp.models.linear import LinearDynamicGP
+from pyro_dynogp.models.linear import LinearDynamicGP, initial_mean
 from pyro_dynogp.parallel import seeded
-from pyro_dynogp.prediction.clock import gap_between
+from pyro_dynogp.prediction.clock import following, gap_between, one_record
 from pyro_dynogp.prediction.prediction import Prediction
 from pyro_dynogp.record import Record
 
 if TYPE_CHECKING:
     from pyro_dynogp.inference.result import Fit
+
+# In the kind of a k-step prediction whose joint samples depend on each other as its errors do.
+JOINT = ", errors drawn jointly"
 
 
 def _model(fit: Fit) -> LinearDynamicGP:
@@ -30,22 +34,57 @@ def _model(fit: Fit) -> LinearDynamicGP:
     return fit.model
 
 
-def prior_process(fit: Fit, record: Record, *, process_noise: bool = True) -> LTIProcess:
-    """Noise-free trajectories along a record, one batch element for each draw."""
+def prior_process(
+    fit: Fit, record: Record, *, process_noise: bool = True, unknown_start: bool = False
+) -> LTIProcess:
+    """Noise-free trajectories along a record, one batch element for each draw.
+
+    Where the first state is a site (``initial_state="site"``) the draws know that of the training
+    record, so that densities given a draw begin there; on other records it is unknown.
+
+    Args:
+        fit: the fit. record: time and inputs. process_noise: False for the deterministic system.
+        unknown_start: whether the first state is unknown on the training record, too, as
+            predictions have it: they serve every record in the same way.
+    """
     model, system = _model(fit), fit.system
     state = None
     if model.initial_state == "site":
-        # The site belongs to the training record; elsewhere the state is unknown again.
+        index = None if unknown_start else _place(fit, record)
+        if index is not None:
+            return process_given(fit, record, index)
         modes = system.modes if process_noise else system.modes.without_process_noise()
         state = model.prior_state(system, modes)
     return model.process(system, record, fit.scaling, state, process_noise=process_noise)
 
 
+def process_given(fit: Fit, record: Record, index: int) -> LTIProcess:
+    """Trajectories as the draws have them of a training record, of which `record` has the times.
+
+    Args:
+        fit: the fit. record: time and inputs. index: of the training record.
+    """
+    model, system = _model(fit), fit.system
+    if model.initial_state != "site":
+        return prior_process(fit, record)
+    suffix = "" if len(fit.records) == 1 else f"_{index}"
+    state = initial_mean(system.past_inputs, fit.draws[f"initial_state{suffix}"])
+    return model.process(system, record, fit.scaling, state)
+
+
+def _place(fit: Fit, record: Record) -> int | None:
+    """Index of a record among the training records, as measured or as the model sees them."""
+    for index, one in enumerate(fit.records):
+        if record.fingerprint in (one.fingerprint, fit.model.check(one)[0].fingerprint):
+            return index
+    return None
+
+
 def simulate(fit: Fit, record: Record, process_noise: bool, samples: int, seed: int) -> Prediction:
     """See `Fit.simulate`."""
-    _one(fit, record)
+    record = one_record(fit, record)
     with torch.no_grad():
-        process = prior_process(fit, record, process_noise=process_noise)
+        process = prior_process(fit, record, process_noise=process_noise, unknown_start=True)
         return _of_process(fit, process, record, samples, seed, "simulation")
 
 
@@ -53,14 +92,13 @@ def forecast(
     fit: Fit, past: Record, future: Record, process_noise: bool, samples: int, seed: int
 ) -> Prediction:
     """See `Fit.forecast`."""
-    _one(fit, past)
-    _one(fit, future)
+    past, future = following(fit, past, future)
     gap = gap_between(past, future)
     if not past.n_outputs:
         raise invalid("past", expected="outputs to start from", got="none")
     with torch.no_grad():
         system, model, scaling = fit.system, _model(fit), fit.scaling
-        before = prior_process(fit, past)
+        before = prior_process(fit, past, unknown_start=True)
         y = past.tensors().outputs
         y = y if model.several_outputs else y[:, 0]
         noise = system.noise_sd
@@ -76,18 +114,19 @@ def forecast(
 
 def predict(fit: Fit, record: Record, horizon: int, samples: int, seed: int) -> Prediction:
     """See `Fit.predict`."""
-    _one(fit, record)
+    record = one_record(fit, record)
     if not record.n_outputs:
         raise invalid("record", expected="outputs to predict from", got="none")
     with torch.no_grad():
-        process = prior_process(fit, record)
+        process = prior_process(fit, record, unknown_start=True)
         observed = process.observed(fit.system.noise_sd)
         y = record.tensors().outputs
         y = y if fit.model.several_outputs else y[:, 0]
         residual, missing = split_missing(observed.rows(y - process.mean))
         v = observed.noise_rows
         v = v if missing is None else v.masked_fill(missing, torch.inf)
-        moments = predict_k_steps(process.covariance(v), residual, horizon)
+        seen = process.covariance(v)
+        moments = predict_k_steps(seen, residual, horizon)
         mean = process.mean + process.from_rows(moments.mean)
         variance = process.from_rows(moments.variance)
     mean_, variance_ = _outputs(fit, mean), _outputs(fit, variance)
@@ -99,13 +138,40 @@ def predict(fit: Fit, record: Record, horizon: int, samples: int, seed: int) -> 
     }
 
     def draw() -> np.ndarray:
-        generator = np.random.default_rng(seed)
-        which = generator.integers(len(mean_), size=samples)
-        sd = np.sqrt(variance_ + noise[:, None, :])
-        return mean_[which] + sd[which] * generator.standard_normal((samples, *mean_.shape[1:]))
+        if horizon == 1 and not fit.model.several_outputs and missing is None:
+            # Errors are innovations, independent of each other.
+            generator = np.random.default_rng(seed)
+            which = generator.integers(len(mean_), size=samples)
+            sd = np.sqrt(variance_ + noise[:, None, :])
+            return mean_[which] + sd[which] * generator.standard_normal((samples, *mean_.shape[1:]))
+        with torch.no_grad(), seeded(seed):
+            errors = prediction_errors(observed, seen, horizon, -(-samples // len(mean_)))
+            return _each(mean_ + _outputs(fit, errors), samples)
 
     kind = f"{horizon}-step prediction"
+    if horizon > 1:
+        kind += JOINT
     return _prediction(fit, record, mean_, variance_, noise, parts, draw, kind)
+
+
+def prediction_errors(
+    observed: ObservedLTIProcess, seen: SemiseparableCovariance, horizon: int, count: int
+) -> Tensor:
+    """Draws (count, S, *event) of the errors of all k-step predictions of a record, jointly.
+
+    Neighbouring errors share innovations: in the steady state of a regular record they are the
+    moving average e_t = sum_{j<k} psi_j nu_{t-j} of the innovations nu. Here they are what the
+    predictor makes of outputs drawn from the model, so that any clock, gaps, the first samples and
+    several outputs are exact, too; one filter pass for each draw.
+
+    Args:
+        observed: distribution of the outputs, batch (S,). horizon: k [samples].
+        seen: covariance of the samples that the predictor sees (missing ones left out).
+        count: number of draws for each of the S.
+    """
+    residual = observed.rows(observed.sample((count,)) - observed.mean)
+    known = residual.masked_fill(seen.missing, 0.0)
+    return observed.from_rows(residual - predict_k_steps(seen, known, horizon).mean)
 
 
 def _of_process(
@@ -128,10 +194,9 @@ def _of_process(
 
     def draw() -> np.ndarray:
         with torch.no_grad(), seeded(seed):
-            count = process.batch_shape[0]
-            each = -(-samples // count)
+            each = -(-samples // process.batch_shape[0])
             y = process.observed(fit.system.noise_sd).sample((each,))
-            return _outputs(fit, y.flatten(0, 1))[:samples]
+            return _each(_outputs(fit, y), samples)
 
     return _prediction(fit, record, mean, variance, noise, parts, draw, kind)
 
@@ -150,8 +215,18 @@ def _prediction(
     return Prediction(record.time, names, mean, variance, noise, parts, draw, kind)
 
 
+def _each(y: np.ndarray, samples: int) -> np.ndarray:
+    """So many of the samples y (R, S, n, n_y), as many of each draw S as of any other, or nearly.
+
+    Those that not all draws give come from draws spread evenly over all of them.
+    """
+    whole, rest = divmod(samples, y.shape[1])
+    evenly = ((np.arange(rest) + 0.5) * y.shape[1] / max(rest, 1)).astype(int)
+    return np.concatenate([y[:whole].reshape(-1, *y.shape[2:]), y[-1, evenly]])
+
+
 def _outputs(fit: Fit, x: Tensor) -> np.ndarray:
-    """(S, n) or (S, n, n_y) to an array (S, n, n_y)."""
+    """(*b, n) or (*b, n, n_y) to an array (*b, n, n_y)."""
     return (x if fit.model.several_outputs else x.unsqueeze(-1)).numpy()
 
 
@@ -159,14 +234,3 @@ def _noise(fit: Fit) -> np.ndarray:
     """Measurement-noise variance (S, n_y)."""
     sd = fit.system.noise_sd
     return (sd if fit.model.several_outputs else sd.unsqueeze(-1)).square().numpy()
-
-
-def _one(fit: Fit, record: Record) -> None:
-    if not isinstance(record, Record):
-        raise invalid(
-            "record",
-            expected="one Record",
-            got=type(record).__name__,
-            advice="Predict several records one after the other.",
-        )
-    fit.model.check(record)

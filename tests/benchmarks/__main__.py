@@ -12,13 +12,17 @@ import numba
 import torch
 
 from tests.benchmarks import (
+    brute_force,
     calibration,
+    calibration_tests,
     cascade_cost,
     criticism,
     electricity,
     example2,
     guides,
+    planted,
     reference,
+    selection,
     speed,
     wiener,
 )
@@ -33,6 +37,10 @@ PARTS = {
     "reference": reference.run,
     "calibration": calibration.run,
     "criticism": criticism.run,
+    "calibration_tests": calibration_tests.run,
+    "selection": selection.run,
+    "brute_force": brute_force.run,
+    "planted": planted.run,
 }
 
 

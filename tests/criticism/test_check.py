@@ -8,6 +8,8 @@ import pytest
 import torch
 
 import pyro_dynogp as dgp
+from pyro_dynogp.criticism.arviz_bridge import good_k
+from pyro_dynogp.criticism.finding import Finding, apart
 from pyro_dynogp.inference.guides import GaussianGuide
 from tests.conftest import simulate_record
 
@@ -16,13 +18,13 @@ QUIET = {"workers": 1, "progress": False}
 
 @pytest.fixture(scope="module")
 def long(one_pair):
-    return simulate_record(one_pair, 0.1, n=400, seed=3)
+    return simulate_record(one_pair, 0.1, n=300, seed=3)
 
 
 @pytest.fixture(scope="module")
 def good(long):
     model = dgp.LinearDynamicGP(inputs=1, pairs=1)
-    return dgp.fit(model, long, method="svi", steps=400, restarts=2, **QUIET)
+    return dgp.fit(model, long, method="svi", steps=250, restarts=2, **QUIET)
 
 
 def test_a_good_fit(good):
@@ -44,6 +46,32 @@ def test_an_overconfident_posterior(good):
     assert found["posterior k"].value > 0.7
     assert not found.good
     assert "posterior k" in found.verdict
+
+
+def test_numbers_near_their_limit_are_told_apart():
+    assert apart(0.5, 0.62) == ("0.50", "0.62")
+    assert apart(0.6203, 0.6157) == ("0.620", "0.616")
+    assert apart(0.61572, 0.61571) == ("0.61572", "0.61571")
+    assert apart(np.inf, 0.7) == ("inf", "0.70")
+    assert apart(0.7, 0.7) == ("0.700000", "0.700000")
+    assert Finding("k", 0.6204, False, "", 0.6201).number == "0.6204"
+    assert Finding("rise", 12345.6, None, "").number == "1.23e+04"
+    assert Finding("none", np.nan, None, "").number == ""
+
+
+def test_k_at_its_limit_is_printed_so_that_it_is_understood(good, monkeypatch):
+    limit = good_k(1000)
+    monkeypatch.setattr(
+        "pyro_dynogp.criticism.check.arviz_bridge.psis", lambda ratio: (None, limit + 4e-4)
+    )
+    found = dgp.check(good)["posterior k"]
+    assert found.good is False
+    assert found.number == "0.6671"
+    assert "k = 0.6671 (good: up to 0.6667)" in found.text
+    monkeypatch.setattr(
+        "pyro_dynogp.criticism.check.arviz_bridge.psis", lambda ratio: (None, limit - 4e-4)
+    )
+    assert dgp.check(good)["posterior k"].good
 
 
 def test_an_elbo_that_still_rises(good):
