@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from pyro_dynogp.criticism.loo import loo
     from pyro_dynogp.criticism.predictive_checks import PredictiveChecks, predictive_checks
     from pyro_dynogp.criticism.pyro_posterior import PyroPosterior
+    from pyro_dynogp.criticism.rank_results import SimulationBasedCalibration
+    from pyro_dynogp.criticism.simulation_based import simulation_based_calibration
     from pyro_dynogp.distributions.conditioned import ConditionedLTIProcess
     from pyro_dynogp.distributions.decay import LogDecayRate
     from pyro_dynogp.distributions.inducing import InducingLTIProcess, inducing_times
@@ -96,6 +98,7 @@ _HOME = {
     "Record": "pyro_dynogp.record",
     "SameAsPrior": "pyro_dynogp.guides.families",
     "Scaling": "pyro_dynogp.scaling",
+    "SimulationBasedCalibration": "pyro_dynogp.criticism.rank_results",
     "Stack": "pyro_dynogp.criticism.comparison",
     "Static": "pyro_dynogp.models.layers",
     "StaticFunction": "pyro_dynogp.layers.static",
@@ -106,6 +109,7 @@ _HOME = {
     "WienerHammerstein": "pyro_dynogp.models.architectures",
     "calibration": "pyro_dynogp.criticism.calibration",
     "check": "pyro_dynogp.criticism.check",
+    "close_loop": "pyro_dynogp.discrepancy.loop",
     "compare": "pyro_dynogp.criticism.comparison",
     "fit": "pyro_dynogp.inference.fit",
     "from_pyro": "pyro_dynogp.criticism.from_pyro",
@@ -116,6 +120,7 @@ _HOME = {
     "sample_modes": "pyro_dynogp.models.priors",
     "sample_static": "pyro_dynogp.layers.static",
     "scores": "pyro_dynogp.prediction.scores",
+    "simulation_based_calibration": "pyro_dynogp.criticism.simulation_based",
     "stack": "pyro_dynogp.criticism.comparison",
     "static_gp": "pyro_dynogp.layers.static",
 }
@@ -160,6 +165,7 @@ __all__ = [
     "Record",
     "SameAsPrior",
     "Scaling",
+    "SimulationBasedCalibration",
     "Stack",
     "Static",
     "StaticFunction",
@@ -170,6 +176,7 @@ __all__ = [
     "WienerHammerstein",
     "calibration",
     "check",
+    "close_loop",
     "compare",
     "datasets",
     "fit",
@@ -182,6 +189,7 @@ __all__ = [
     "sample_modes",
     "sample_static",
     "scores",
+    "simulation_based_calibration",
     "stack",
     "static_gp",
 ]

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 
 from pyro_dynogp import datasets, plotting
+from pyro_dynogp.discrepancy.loop import close_loop
+from pyro_dynogp.discrepancy.report import Report
 from pyro_dynogp.inference.fit import Fit, fit
 from pyro_dynogp.models.linear import LinearDynamicGP
 from pyro_dynogp.prediction.prediction import Prediction
@@ -130,18 +132,24 @@ def run_demo(
     pairs: int = 5,
     restarts: int = 4,
     steps: int = 600,
+    rounds: int = 1,
     workers: int | None = None,
 ) -> dict[str, Any]:
     """Identify the coupled drives by variational inference; write the model, scores and figures.
+
+    Then close the loop: a linear model does not know that the sensor reports the size of the speed
+    alone, and is to find out (`pyro_dynogp.close_loop`).
 
     Args:
         output_directory: made where it is missing; files of earlier runs are overwritten.
         progress: whether to show progress bars (on the standard error stream).
         pairs: number of pole pairs. restarts: number of starts. steps: most steps of SVI.
+        rounds: most effects that are added to the linear model; 0 leaves this part out.
         workers: number of processes; None for all processors.
 
     Returns:
-        "fit"; "scores" by kind of prediction; "files"; "seconds" that it took.
+        "fit"; "scores" by kind of prediction; "report" of the loop, or None; "files"; "seconds"
+        that it took.
     """
     begin = time.perf_counter()
     directory = Path(output_directory)
@@ -174,8 +182,15 @@ def run_demo(
     fitted.save(model_file)
     numbers = {name: dict(result.scores) for name, result in results.items()}
     score_file.write_text(json.dumps(numbers, indent=2) + "\n", encoding="utf-8")
-    seconds = time.perf_counter() - begin
     print(f"\n{HONEST}\n")
+    report = None
+    if rounds:
+        report = _closed_loop(data.full, rounds, workers, progress)
+        print(f"{report}\n")
+        page = directory / "report.html"
+        report.to_html(page)
+        print(f"Report:  {page}")
+    seconds = time.perf_counter() - begin
     print(f"Figures: {directory}/*.png ({', '.join(path.stem for path in files)})")
     print(f"Model:   {model_file} (pyro_dynogp.load reads it)")
     print(f"Scores:  {score_file}")
@@ -183,6 +198,16 @@ def run_demo(
     return {
         "fit": fitted,
         "scores": numbers,
+        "report": report,
         "files": [*files, model_file, score_file],
         "seconds": seconds,
     }
+
+
+def _closed_loop(record: Record, rounds: int, workers: int | None, progress: bool) -> Report:
+    """What a linear model of the first half of a record lacks."""
+    print("Closing the loop: what does a linear model of the first 260 samples lack?")
+    linear = fit(
+        LinearDynamicGP(inputs=1, pairs=3), record[:260], workers=workers, progress=progress
+    )
+    return close_loop(linear, record, max_rounds=rounds, workers=workers, progress=progress)

@@ -352,7 +352,7 @@ def test_demo(tmp_path, capsys, monkeypatch):
     )
     monkeypatch.setattr(datasets, "load", lambda name: data)
     out = tmp_path / "a" / "demo"
-    result = demo.run_demo(out, progress=False, pairs=1, restarts=1, steps=60, workers=1)
+    result = demo.run_demo(out, progress=False, pairs=1, restarts=1, steps=60, rounds=0, workers=1)
     printed = capsys.readouterr()
     assert printed.err == ""
     for kind in ("simulation", "forecast", "one-step"):

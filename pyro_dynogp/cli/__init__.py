@@ -1,4 +1,4 @@
-"""Command line: pyro-dynogp demo, info, fit, simulate.
+"""Command line: pyro-dynogp demo, info, fit, simulate, close-loop.
 
 Torch and Pyro are imported inside the commands, so that ``--help`` need not wait for them.
 """
@@ -10,7 +10,9 @@ from typing import Any
 
 import click
 
+from pyro_dynogp.cli.close_loop import close_loop
 from pyro_dynogp.cli.data import InvalidInput, record_for, training_and_test
+from pyro_dynogp.cli.options import CLOCK
 
 
 class _Group(click.Group):
@@ -45,30 +47,6 @@ def _check_folder(option: str, path: Path) -> None:
         raise InvalidInput(f"{option}: there is no folder {folder}.")
 
 
-def _options(*decorators: Any) -> Any:
-    def apply(command: Any) -> Any:
-        for decorator in reversed(decorators):
-            command = decorator(command)
-        return command
-
-    return apply
-
-
-_CLOCK = _options(
-    click.option("--time", metavar="COLUMN", help="Column of times: numbers or ISO 8601 stamps."),
-    click.option(
-        "--sampling-time",
-        type=click.FloatRange(min=0, min_open=True),
-        metavar="S",
-        help="Step between samples, where there is no column of times.",
-    ),
-    click.option("--timezone", metavar="TZ", help="Zone of the stamps, such as Europe/Vienna."),
-    click.option(
-        "--time-unit",
-        metavar="UNIT",
-        help="Unit of numeric times [s, or the model's].",
-    ),
-)
 _PLAIN = {"context_settings": {"help_option_names": ["-h", "--help"], "max_content_width": 100}}
 
 
@@ -84,6 +62,7 @@ def main() -> None:
       pyro-dynogp fit plant.csv --input valve --output level --sampling-time 0.5 \\
           --train 800 --save plant.safetensors --figures figures
       pyro-dynogp simulate plant.safetensors next_week.csv --sampling-time 0.5 --out level.csv
+      pyro-dynogp close-loop plant.csv --input valve --output level --sampling-time 0.5
 
     Exit codes: 0 done, 1 unexpected error, 2 input that has to be put right.
     """  # noqa: D301 (\b is click's mark of a paragraph that keeps its lines)
@@ -135,7 +114,7 @@ def info(subject: str | None) -> None:
 @click.option(
     "--output", "outputs", multiple=True, metavar="NAME", help="Output column; repeatable."
 )
-@_CLOCK
+@CLOCK
 @click.option(
     "--unit",
     "units",
@@ -247,7 +226,7 @@ def fit(
 @main.command()
 @click.argument("model", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 @click.argument("data")
-@_CLOCK
+@CLOCK
 @click.option(
     "--out", required=True, type=click.Path(dir_okay=False, path_type=Path), metavar="CSV",
     help="Write mean, standard deviation and 95 % interval here; - for standard output.",
@@ -294,3 +273,6 @@ def simulate(
     else:
         frame.to_csv(out)
         click.echo(f"{len(frame)} rows in {out}")
+
+
+main.add_command(close_loop)

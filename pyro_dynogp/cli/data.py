@@ -133,11 +133,84 @@ def record_for(fitted: Fit, data: str, clock: dict[str, Any]) -> tuple[Record, b
     return record, measured
 
 
+def whole_record(
+    data: str,
+    inputs: tuple[str, ...],
+    outputs: tuple[str, ...],
+    units: tuple[str, ...],
+    clock: dict[str, Any],
+    candidates: tuple[str, ...],
+) -> tuple[Record, tuple[str, ...]]:
+    """Read a CSV file or a data set with the channels that a model does not use.
+
+    Args:
+        data: file or name. inputs: names of columns. outputs: names of columns.
+        units: NAME=UNIT of columns. clock: options of `Record.from_csv` about time.
+        candidates: columns to keep as extra channels; none named for all that hold numbers.
+
+    Returns:
+        The record, and the columns left out since they hold text or nothing.
+    """
+    if twice := set(candidates) & {*inputs, *outputs}:
+        raise InvalidInput(f"--candidates: {sorted(twice)} are inputs or outputs already.")
+    if data in DATASETS:
+        _refuse(data, clock | {"unit": units})
+        record = _selected(data, inputs, outputs).full
+        if record is None:
+            raise InvalidInput(f"{data}: is not one record, which closing the loop needs.")
+        unknown = [name for name in candidates if name not in record.extra]
+        if unknown:
+            raise InvalidInput(f"--candidates: {unknown} not among {list(record.extra)}.")
+        kept = {name: record.extra[name] for name in candidates or record.extra}
+        known = {name: record.extra_units[name] for name in kept}
+        return replace(record, extra=kept, extra_units=known), ()
+    path = existing(data)
+    if not outputs:
+        raise InvalidInput(
+            f"--output: name one output column or more; pyro-dynogp info {path} lists the columns."
+        )
+    used = (*inputs, *outputs, clock["time"])
+    extra, left_out = (candidates, ()) if candidates else _numeric(path, used)
+    known = _units(units, (*inputs, *outputs, *extra))
+    record = _from_csv(
+        path,
+        inputs,
+        outputs,
+        clock,
+        extra=extra,
+        input_units=[known.get(name, "") for name in inputs],
+        output_units=[known.get(name, "") for name in outputs],
+        extra_units={name: known.get(name, "") for name in extra},
+    )
+    return record, left_out
+
+
+def _numeric(path: Path, used: tuple[str | None, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Other columns of a file: those that hold numbers, and those that hold text or nothing."""
+    import numpy as np
+
+    from pyro_dynogp._text_table import read_table
+
+    table = read_table(path, None, None, None, None, "utf-8-sig")
+    kept: list[str] = []
+    left_out: list[str] = []
+    for name in table.columns:
+        if name in used:
+            continue
+        try:
+            some = bool(np.isfinite(table.numbers(name)).any())
+        except ValueError:  # a cell that is no number
+            some = False
+        (kept if some else left_out).append(name)
+    return tuple(kept), tuple(left_out)
+
+
 def _from_csv(
     path: Path,
     inputs: tuple[str, ...],
     outputs: tuple[str, ...],
     clock: dict[str, Any],
+    extra: tuple[str, ...] = (),
     **units: Any,
 ) -> Record:
     from pyro_dynogp.record import Record
@@ -146,7 +219,7 @@ def _from_csv(
     if (clock["time"] is None) == (clock["sampling_time"] is None):
         raise InvalidInput("--time COLUMN or --sampling-time S: give one of the two.")
     clock = clock | {"time_unit": clock["time_unit"] or "s"}
-    return Record.from_csv(path, inputs, outputs, extra=None, **clock, **units)
+    return Record.from_csv(path, inputs, outputs, extra=extra, **clock, **units)
 
 
 def _units(pairs: tuple[str, ...], names: tuple[str, ...]) -> dict[str, str]:
@@ -155,7 +228,7 @@ def _units(pairs: tuple[str, ...], names: tuple[str, ...]) -> dict[str, str]:
         name, mark, unit = pair.partition("=")
         if not mark or name not in names:
             raise InvalidInput(
-                f"--unit: expected NAME=UNIT with the name of an input or output, got {pair!r}."
+                f"--unit: expected NAME=UNIT with the name of a column that is read, got {pair!r}."
             )
         units[name] = unit
     return units

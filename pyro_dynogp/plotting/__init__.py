@@ -6,13 +6,16 @@ no display needed. Save it with ``figure.savefig("name.png")``; a notebook shows
 
 from pyro_dynogp.plotting.calibration import calibration, predictive_checks
 from pyro_dynogp.plotting.diagnostics import history, residuals, starts
+from pyro_dynogp.plotting.discrepancy import before_after, evidence, residuals_before_after
 from pyro_dynogp.plotting.signals import prediction, record
 from pyro_dynogp.plotting.style import named
 from pyro_dynogp.plotting.systems import bode, impulse_response, pole_map
 
 __all__ = [
+    "before_after",
     "bode",
     "calibration",
+    "evidence",
     "history",
     "impulse_response",
     "named",
@@ -21,5 +24,6 @@ __all__ = [
     "predictive_checks",
     "record",
     "residuals",
+    "residuals_before_after",
     "starts",
 ]

@@ -1,0 +1,121 @@
+"""The command that looks for what a model lacks, and adds it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from pyro_dynogp.cli.data import InvalidInput, whole_record
+from pyro_dynogp.cli.options import CLOCK
+
+
+@click.command(name="close-loop")
+@click.argument("data")
+@click.option("--input", "inputs", multiple=True, metavar="NAME", help="Input column; repeatable.")
+@click.option(
+    "--output", "outputs", multiple=True, metavar="NAME", help="Output column; repeatable."
+)
+@CLOCK
+@click.option(
+    "--unit", "units", multiple=True, metavar="NAME=UNIT",
+    help="Unit of a column, for labels and checks; repeatable.",
+)  # fmt: skip
+@click.option(
+    "--candidates", multiple=True, metavar="NAME",
+    help="Column that may act on the output although the model does not use it; repeatable. "
+    "All other columns of numbers if not given.",
+)  # fmt: skip
+@click.option(
+    "--model", "kind", type=click.Choice(["linear", "wiener"]), default="linear",
+    show_default=True, help="Linear dynamics; or linear dynamics, then a static function.",
+)  # fmt: skip
+@click.option(
+    "--pairs", type=click.IntRange(min=1), default=5, show_default=True,
+    help="Number of pole pairs (half the order).",
+)  # fmt: skip
+@click.option(
+    "--restarts", type=click.IntRange(min=1), metavar="N",
+    help="Number of points from which the optimum of the first fit is sought.",
+)  # fmt: skip
+@click.option(
+    "--max-rounds", type=click.IntRange(min=1), default=4, show_default=True,
+    help="Most effects that are added, one in each round.",
+)  # fmt: skip
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True,
+    help="The same seed gives the same report.",
+)  # fmt: skip
+@click.option(
+    "--out", type=click.Path(file_okay=False, path_type=Path), default=Path("close_loop_output"),
+    show_default=True, metavar="FOLDER",
+    help="Folder for the report and the extended model; made where it is missing.",
+)  # fmt: skip
+@click.option(
+    "--workers", type=click.IntRange(min=1), metavar="N",
+    help="Processes; all processors if not given.",
+)  # fmt: skip
+@click.option("--quiet", is_flag=True, help="No progress bars.")
+def close_loop(
+    data: str,
+    inputs: tuple[str, ...],
+    outputs: tuple[str, ...],
+    units: tuple[str, ...],
+    candidates: tuple[str, ...],
+    kind: str,
+    pairs: int,
+    restarts: int | None,
+    max_rounds: int,
+    seed: int,
+    out: Path,
+    workers: int | None,
+    quiet: bool,
+    **clock: Any,
+) -> None:
+    """Find what a model of DATA lacks, add it, and report how much better it predicts.
+
+    DATA is a CSV file or the name of a data set. A model is fitted to the first half of it; the
+    next quarter is searched for effects, and the last quarter is opened once, for the report.
+    Writes report.html (a page for people), report.json and model.safetensors.
+
+    \b
+    Examples:
+      pyro-dynogp close-loop plant.csv --input valve --output level --sampling-time 0.5
+      pyro-dynogp close-loop plant.csv --input valve --output level --time stamp \\
+          --candidates ambient --candidates feed --pairs 3 --out report
+    """  # noqa: D301
+    record, left_out = whole_record(data, inputs, outputs, units, clock, candidates)
+    import pyro_dynogp as dgp
+    from pyro_dynogp.discrepancy.blocks import FEWEST
+
+    if len(record) < 4 * FEWEST:
+        raise InvalidInput(f"{data}: has {len(record)} samples; {4 * FEWEST} are needed.")
+    out.mkdir(parents=True, exist_ok=True)
+    if left_out:
+        click.echo(f"Left out, as they hold no numbers: {', '.join(left_out)}", err=True)
+    made = dgp.LinearDynamicGP if kind == "linear" else dgp.Wiener
+    fitted = dgp.fit(
+        made(inputs=record.n_inputs, outputs=record.n_outputs, pairs=pairs),
+        record[: len(record) // 2],
+        seed=seed,
+        restarts=restarts,
+        workers=workers,
+        progress=not quiet,
+    )
+    # The candidates are the record's extra channels.
+    report = dgp.close_loop(
+        fitted,
+        record,
+        candidates=None,
+        seed=seed,
+        max_rounds=max_rounds,
+        workers=workers,
+        progress=not quiet,
+    )
+    click.echo(str(report))
+    report.to_html(out / "report.html")
+    report.to_json(out / "report.json")
+    report.fit.save(out / "model.safetensors")
+    click.echo(f"\nReport: {out / 'report.html'} (numbers: {out / 'report.json'})")
+    click.echo(f"Model:  {out / 'model.safetensors'} (pyro_dynogp.load reads it)")

@@ -1,0 +1,109 @@
+"""Is there any structure left at all? The question before any effect is named."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import stats
+
+from pyro_dynogp.discrepancy.evidence import Residuals
+from pyro_dynogp.discrepancy.paths import looked_at, own
+from pyro_dynogp.discrepancy.responses import responses, standardised
+from pyro_dynogp.discrepancy.scan import tail_probability
+from pyro_dynogp.discrepancy.serial_effects import held_out_innovations, portmanteau
+from pyro_dynogp.discrepancy.sieve import columns_score, replicates, sieve, spanning
+from pyro_dynogp.signals import held, hermite
+
+# Of 50 replicates each.
+BATCHES = 8
+# Below this probability the sentence says that structure is left.
+LEVEL = 0.05
+
+
+def structure_left(residuals: Residuals, seed: int = 0) -> tuple[float, str]:
+    """Test whether anything is left in a residual, in four independent ways.
+
+    1. Held-out one-step errors depend on earlier ones; 2. so does their size; 3. their
+    distribution is not normal; 4. the held-out residual follows linear responses of inputs or
+    candidates, of their squares and cubes, or slow functions of time. Each is calibrated by
+    simulation or permutation; the smallest of the four p-values is paid for by Sidak's formula,
+    which is exact where they are independent and safe where they go together.
+
+    Args:
+        residuals: of one output (n,). seed: of the simulated nulls.
+
+    Returns:
+        Probability of as much structure where there is none, and a sentence.
+
+    Raises:
+        ValueError: where fewer than 30 held-out samples are measured.
+
+    Source: 1: Ljung & Box, Biometrika 65(2):297 (1978); 2: McLeod & Li, J. Time Series Analysis
+    4(4):269 (1983); 3: Anderson & Darling, JASA 49(268):765 (1954); Sidak, JASA 62(318):626 (1967).
+    """
+    r = residuals
+    v = held_out_innovations(r)
+    ways = {
+        "one-step errors depend on earlier ones": portmanteau(v, seed, signs=True)[1],
+        "the size of one-step errors depends on that of earlier ones": portmanteau(
+            np.abs(v - np.nanmean(v)), seed + 1
+        )[1],
+        "one-step errors are not normal": _not_normal(v[np.isfinite(v)], seed),
+        "the residual follows inputs, other channels or time": _follows(r, seed),
+    }
+    smallest = min(ways.values())
+    p_value = float(-np.expm1(len(ways) * np.log1p(-min(smallest, 1.0 - 1e-12))))
+    if p_value >= LEVEL:
+        return p_value, f"No structure is left in {r.output_name!r} (p = {p_value:.2g})."
+    seen = [way for way, p in ways.items() if len(ways) * p < LEVEL]
+    seen = seen or [min(ways, key=lambda way: ways[way])]
+    return (
+        p_value,
+        f"Structure is left in {r.output_name!r} (p = {p_value:.2g}): {'; '.join(seen)}.",
+    )
+
+
+def _not_normal(v: np.ndarray, seed: int) -> float:
+    """Probability of as large an Anderson-Darling statistic, mean and variance estimated."""
+    generator = np.random.default_rng([seed, 2])
+    # In batches: memory grows with the record.
+    null = [_anderson_darling(generator.standard_normal((50, len(v)))) for _ in range(BATCHES)]
+    return tail_probability(
+        np.log(np.concatenate(null)), float(np.log(_anderson_darling(v[None]))[0])
+    )
+
+
+def _anderson_darling(x: np.ndarray) -> np.ndarray:
+    """Statistics (R,) of samples (R, m), standardised by their own mean and deviation."""
+    m = x.shape[1]
+    z = np.sort((x - x.mean(1, keepdims=True)) / x.std(1, ddof=1, keepdims=True), axis=1)
+    weights = (2.0 * np.arange(1, m + 1) - 1.0) / m
+    return -m - (stats.norm.logcdf(z) + stats.norm.logsf(z[:, ::-1])) @ weights
+
+
+def _follows(r: Residuals, seed: int) -> float:
+    """Probability of as much that inputs, candidates, their powers or time explain."""
+    x = np.where(r.held_out, r.residual, np.nan)
+    each = looked_at(r) // (16 * max(len(r.input_names) + len(r.candidates), 1))
+    constants = int(np.clip(each, 1, 4))
+    t = (r.time - r.time[0]) / (r.time[-1] - r.time[0])
+    slow = np.cos(np.pi * t[:, None] * np.arange(1, 5))
+    blocks = [own(r), slow]
+    for signal in [r.mean, *r.inputs.T, *r.candidates.values()]:
+        u = held(signal)
+        if np.std(u) > 0:
+            blocks.append(responses(hermite(u), r.step, r.time, constants=constants))
+    for signal in r.candidates.values():
+        blocks.append(responses(held(signal), r.step, r.time, constants=constants))
+    ends = np.cumsum([b.shape[1] for b in blocks])
+    variants = [np.arange(e - b.shape[1], e) for b, e in zip(blocks, ends, strict=True)]
+    columns = standardised(np.column_stack(blocks))
+    found = sieve(
+        x,
+        columns_score(columns, variants, spanning(columns[:, :0]), ~np.isfinite(x)),
+        np.array([len(v) for v in variants]),
+        deviations=r.deviations,
+        first=slow,
+        replicates=replicates(len(r), columns.shape[1]),
+        seed=seed,
+    )
+    return found.p_value

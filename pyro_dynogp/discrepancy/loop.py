@@ -1,0 +1,373 @@
+"""Close the loop: find the residual, name the effect, add it, report the error before and after."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pyro_dynogp._errors import invalid
+from pyro_dynogp.channels import count_direct
+from pyro_dynogp.criticism.comparison import block_standard_error
+from pyro_dynogp.criticism.posterior_draws import draws_of
+from pyro_dynogp.discrepancy import words
+from pyro_dynogp.discrepancy.blocks import Blocks, blocks_of, joined
+from pyro_dynogp.discrepancy.effects import CATALOGUE, Effect
+from pyro_dynogp.discrepancy.evidence import Residuals
+from pyro_dynogp.discrepancy.extend import Model, used_channels
+from pyro_dynogp.discrepancy.gate import structure_left
+from pyro_dynogp.discrepancy.noise_effects import data_faults
+from pyro_dynogp.discrepancy.report import Attempt, FoundEffect, Report
+from pyro_dynogp.discrepancy.residuals import residuals_of
+from pyro_dynogp.discrepancy.search import Confirmed, Found, candidates_of, confirm, look
+from pyro_dynogp.discrepancy.trials import one_step_density, poles_of, quick_fit
+from pyro_dynogp.inference.fit import fit as fit_model
+from pyro_dynogp.models.cascade import Cascade
+from pyro_dynogp.models.layers import Static
+from pyro_dynogp.parallel import parallel_map
+from pyro_dynogp.prediction.scores import scores
+from pyro_dynogp.record import Record
+
+if TYPE_CHECKING:
+    from pyro_dynogp.inference.result import Fit
+
+SCORES = ("rmse", "mae", "nrmse", "crps", "coverage_50", "coverage_95")
+
+
+def close_loop(
+    fit: Fit,
+    record: Record,
+    *,
+    candidates: Sequence[str] | Record | None = None,
+    seed: int = 0,
+    max_rounds: int = 4,
+    level: float = 0.05,
+    tries: int = 8,
+    effects: Sequence[Effect] = CATALOGUE,
+    workers: int | None = None,
+    progress: bool = True,
+) -> Report:
+    """Say what a fitted model lacks, add it, and report the error before and after.
+
+    Block A is what the model is fitted to, B is searched, C is opened once, at the end. A round
+    first asks whether there is any structure in the residuals at all (an omnibus test, or a false
+    discovery rate below `level` for one effect); if so, effects whose test rejects at `level`, and
+    their nearest relatives, are added to the model one at a time and fitted to A; the one that
+    raises the log-density of held-out data most is kept if it does so by more than two block
+    standard errors and 4 nats. Of effects that explain as much the one that leaves least open is
+    kept, and the others are reported as ties. Rounds end where nothing is left, or nothing helps.
+
+    Args:
+        fit: a fit to one record.
+        record: the training record, its continuation, or both; see `discrepancy.blocks`.
+        candidates: extra channels that may act: names in ``record.extra`` (None: all of them), or
+            a record on the same times whose channels they are.
+        seed: the same seed gives the same report. max_rounds: most effects that are added.
+        level: of the tests. tries: most effects that are refitted in a round.
+        effects: what is looked for, `CATALOGUE` and your own.
+        workers: processes; None for all processors, or the cluster of
+            ``joblib.parallel_config``. progress: whether to show progress bars.
+
+    Raises:
+        ValueError: on blocks that are too short, unknown candidates, numbers that make no sense.
+    """
+    if not isinstance(max_rounds, int) or max_rounds < 1:
+        raise invalid("max_rounds", expected="a whole number >= 1", got=repr(max_rounds))
+    if not 0.0 < level < 1.0:
+        raise invalid("level", expected="a number between 0 and 1", got=repr(level))
+    clock = _Clock()
+    other = candidates if isinstance(candidates, Record) else None
+    data = blocks_of(fit, record, other)
+    names = _names(fit, data.known, candidates)
+    begin = int(np.argmax(data.held_out))
+    poles = poles_of(fit)
+    first = quick_fit(fit.model, data.known[:begin], poles, seed) if data.refit else fit
+    current = first
+    clock.next("fit of block A")
+    state = _State(data, names, seed, level, tries, effects, workers, progress)
+    model: Model = replace(fit.model, scaling=None)
+    attempts: list[Attempt] = []
+    accepted: list[tuple[Found, Confirmed]] = []
+    warnings: list[str] = []
+    left = False
+    for number in range(1, max_rounds + 1):
+        known = {one.effect.name for one, _ in accepted}
+        residuals, found, skipped = state.look(current, known)
+        clock.next("residual tests")
+        if number == 1:
+            warnings += [*_faults(residuals, data.known), *skipped]
+        warnings += _reported(found, level, warnings)
+        left = state.structure(residuals, found)
+        chosen = candidates_of(found, model, data.known, level, tries) if left else []
+        attempts += _untried(found, chosen, level, number)
+        if not chosen:
+            break
+        confirmed = state.confirm(chosen, model, poles_of(current), number)
+        clock.next("refits")
+        attempts += confirmed.attempts
+        if confirmed.winner is None or confirmed.model is None:
+            break
+        accepted.append((confirmed.winner, confirmed))
+        model = confirmed.model
+        current = quick_fit(model, data.known[:begin], poles_of(current), seed)
+        left = False
+    fits = [first, current] if accepted else [first]
+    fitted = _final(fits, data.known, workers, progress)
+    base, extended = fitted[0], fitted[-1]
+    clock.next("last fits")
+    return _report(
+        fit, base, extended, data, state, accepted, attempts, warnings, left, clock.seconds
+    )
+
+
+class _Clock:
+    """Seconds by stage."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def next(self, stage: str) -> None:
+        now = time.perf_counter()
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._last
+        self._last = now
+
+
+class _State:
+    """What stays the same in all rounds."""
+
+    def __init__(
+        self,
+        data: Blocks,
+        names: Sequence[str],
+        seed: int,
+        level: float,
+        tries: int,
+        effects: Sequence[Effect],
+        workers: int | None,
+        progress: bool,
+    ) -> None:
+        self.data, self.names, self.seed = data, names, seed
+        self.level, self.tries, self.effects = level, tries, effects
+        self.workers, self.progress = workers, progress
+
+    def residuals(self, fit: Fit, record: Record, held_out: np.ndarray) -> list[Residuals]:
+        taken = used_channels(fit.model)
+        free = [name for name in self.names if name not in taken]
+        return [
+            residuals_of(fit, record, held_out=held_out, candidates=free, output=a, seed=self.seed)
+            for a in range(record.n_outputs)
+        ]
+
+    def look(
+        self, fit: Fit, known: Collection[str]
+    ) -> tuple[list[Residuals], list[Found], list[str]]:
+        """Residuals, evidence of all effects but those that are known, what was not tested."""
+        residuals = self.residuals(fit, self.data.known, self.data.held_out)
+        effects = [e for e in self.effects if not (e.once and e.name in known)]
+        found, skipped = look(
+            residuals, effects, seed=self.seed, workers=self.workers, progress=self.progress
+        )
+        return residuals, found, skipped
+
+    def confirm(
+        self, chosen: Any, model: Model, poles: np.ndarray | None, number: int
+    ) -> Confirmed:
+        return confirm(
+            chosen, model, self.data.known, self.data.held_out, poles, number=number,
+            seed=self.seed, workers=self.workers, progress=self.progress,
+        )  # fmt: skip
+
+    def structure(self, residuals: Sequence[Residuals], found: Sequence[Found]) -> bool:
+        """Whether anything is left: by the omnibus test, or by one of the others, all paid for."""
+        omnibus = min(structure_left(one, seed=self.seed)[0] for one in residuals)
+        lowest = min((f.q_value for f in found), default=1.0)
+        return min(1.0, omnibus * len(residuals)) < self.level or lowest < self.level
+
+
+def _faults(residuals: Sequence[Residuals], record: Record) -> list[str]:
+    """Faults of the data, in words; samples that tests leave out are none."""
+    whole = [replace(one, output=record.outputs[:, a]) for a, one in enumerate(residuals)]
+    return [text for one in whole for text in data_faults(one)]
+
+
+def _names(fit: Fit, record: Record, candidates: Sequence[str] | Record | None) -> list[str]:
+    """Candidate channels, in the order of their names, so that the record's order is no matter."""
+    if isinstance(candidates, str):
+        raise invalid("candidates", expected="a list of names", got=repr(candidates))
+    if candidates is None:
+        names = list(record.extra)
+    elif isinstance(candidates, Record):
+        names = [*candidates.input_names, *candidates.output_names, *candidates.extra]
+    else:
+        names = list(candidates)
+        unknown = sorted(set(names) - set(record.extra))
+        if unknown:
+            raise invalid(
+                "candidates", expected=f"extra channels {list(record.extra)}", got=f"{unknown}"
+            )
+    return sorted(set(names) - used_channels(fit.model))
+
+
+def _reported(found: Sequence[Found], level: float, known: Sequence[str]) -> list[str]:
+    """Effects that are not fixed, only said."""
+    texts = [
+        f.evidence.sentence for f in found if f.effect.name == "feedback" and f.q_value <= level
+    ]
+    return [text for text in texts if text not in known]
+
+
+def _untried(
+    found: Sequence[Found], chosen: Sequence[tuple[Found, Any]], level: float, number: int
+) -> list[Attempt]:
+    """Effects that the residual speaks for, but that were not refitted."""
+    tried = [one for one, _ in chosen]
+    return [
+        Attempt(
+            number, f.evidence, f.q_value,
+            "reported" if f.effect.name == "feedback" else "not tried",
+            "is reported, not added" if f.effect.name == "feedback"
+            else "others are more probable, or no block of the model stands for it",
+        )
+        for f in found
+        if f.q_value <= level and not any(f is one for one in tried)
+    ]  # fmt: skip
+
+
+def _final(fits: Sequence[Fit], record: Record, workers: int | None, progress: bool) -> list[Fit]:
+    """Models of block A fitted to A and B, by all starts that `pyro_dynogp.fit` makes.
+
+    Refits of the search are posterior modes from few starts; here the best optimum is wanted, and
+    the posterior of static functions.
+    """
+
+    def one(given: Fit) -> Fit:
+        model = replace(given.model, scaling=None)
+        functions = isinstance(model, Cascade) and any(
+            isinstance(layer, Static) for layer in model.layers
+        )
+        method = "svi" if functions or given.method != "map" else "map"
+        return fit_model(model, record, method=method, seed=given.seed, workers=1, progress=False)  # type: ignore[arg-type]
+
+    return parallel_map(one, fits, workers=workers, progress=progress, description="last fits")
+
+
+def _report(
+    fit: Fit,
+    base: Fit,
+    extended: Fit,
+    data: Blocks,
+    state: _State,
+    accepted: Sequence[tuple[Found, Confirmed]],
+    attempts: Sequence[Attempt],
+    warnings: Sequence[str],
+    left: bool,
+    seconds: Mapping[str, float],
+) -> Report:
+    """Open block C, once."""
+    forecasts = [one.forecast(data.known, data.sealed, seed=state.seed) for one in (base, extended)]
+    before, after = ({k: _mean(v) for k, v in scores(f, data.sealed).items() if k in SCORES}
+                     for f in forecasts)  # fmt: skip
+    whole = _whole(data)
+    sealed = np.zeros(len(whole), dtype=bool)
+    sealed[len(data.known) :] = True
+    densities = [one_step_density(one, whole)[sealed] for one in (base, extended)]
+    there = np.isfinite(densities[0])
+    gain = densities[1][there] - densities[0][there]
+    tests: dict[str, tuple[float, float]] = {}
+    if accepted:
+        pairs = [state.residuals(one, whole, sealed) for one in (base, extended)]
+        for found, _ in accepted:
+            tests[found.effect.name] = tuple(  # type: ignore[assignment]
+                _smallest(found.effect, several, state.seed) for several in pairs
+            )
+    return Report(
+        effects=tuple(_effect(f, c, extended) for f, c in accepted),
+        outcome=_outcome(bool(accepted), left),
+        before=before,
+        after=after,
+        elpd_gain=float(gain.sum()),
+        elpd_gain_error=block_standard_error(gain)[0],
+        fit=extended,
+        base=base,
+        attempts=tuple(attempts),
+        warnings=tuple(warnings),
+        data=data.sentence,
+        tests=tests,
+        sealed=data.sealed,
+        known=data.known,
+        forecast_before=forecasts[0],
+        forecast_after=forecasts[1],
+        model_before=words.describe(base.model),
+        model_after=words.describe(extended.model),
+        seconds=dict(seconds),
+    )
+
+
+def _whole(data: Blocks) -> Record:
+    """All three blocks in one piece again."""
+    return joined(data.known, data.sealed)
+
+
+def _outcome(added: bool, left: bool) -> str:
+    if added:
+        return "effects added, structure left" if left else "effects added"
+    return "structure left, cause unknown" if left else "nothing missing"
+
+
+def _smallest(effect: Effect, residuals: Sequence[Residuals], seed: int) -> float:
+    """Smallest p-value of an effect's tests; 1 where there is nothing left to test."""
+    found = [e.p_value for one in residuals for e in effect.detect(one, seed=seed)]
+    return min(found, default=1.0)
+
+
+def _effect(found: Found, confirmed: Confirmed, extended: Fit) -> FoundEffect:
+    attempt, tried = confirmed.attempt, confirmed.tried
+    assert attempt is not None
+    assert tried is not None
+    assert confirmed.model is not None
+    before = len(confirmed.before.channels)
+    own = confirmed.model.channels[before:]
+    block = words.in_words(own[0]) if own else "; ".join(words.describe(confirmed.model))
+    return FoundEffect(
+        name=found.effect.name,
+        sentence=found.effect.sentence(found.evidence, confirmed.model),
+        p_value=found.evidence.p_value,
+        q_value=found.q_value,
+        gain=attempt.gain,
+        gain_error=attempt.gain_error,
+        parameters=_weights(extended, own),
+        block=block,
+        curve=found.evidence.curve,
+        ties=confirmed.ties,
+        experiment=words.experiment(found.effect.name, confirmed.ties),
+    )
+
+
+def _weights(fit: Fit, channels: Sequence[Any]) -> dict[str, tuple[float, float]]:
+    """Posterior mean and sd of what a direct channel adds to the output, by column [output]."""
+    out: dict[str, tuple[float, float]] = {}
+    if "direct" not in fit.mode:
+        return out
+    drawn = draws_of(fit, count=200, seed=0, anneal=False).values if fit.method == "map" else (
+        fit.draws
+    )  # fmt: skip
+    first = fit.model.inputs - fit.model.direct
+    offset = fit.model.direct - count_direct(fit.model.channels)
+    names = fit.scaling.input_names[first:]
+    weights = drawn["direct"][:, 0].numpy() * fit.scaling.output_scale[0]
+    weights = weights / fit.scaling.input_scale[first:]
+    for channel in channels:
+        for name in channel.names:
+            if channel.direct and name in names[offset:]:
+                column = weights[:, names.index(name)]
+                out[name] = float(column.mean()), float(column.std())
+    return out
+
+
+def _mean(value: Any) -> float:
+    """A score, averaged over outputs where there are several."""
+    return float(np.mean(value))

@@ -1,0 +1,186 @@
+"""What closing the loop came to."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from pyro_dynogp.discrepancy.evidence import Curve, Evidence
+
+if TYPE_CHECKING:
+    from pyro_dynogp.inference.result import Fit
+    from pyro_dynogp.prediction.prediction import Prediction
+    from pyro_dynogp.record import Record
+
+Decision = Literal["accepted", "tie", "rejected", "not tried", "reported"]
+
+
+@dataclass(frozen=True, eq=False)
+class Attempt:
+    """One effect that was considered in one round.
+
+    Attributes:
+        round: number, from 1. evidence: of the test. q_value: false discovery rate at which it
+            passes among all tests of the round.
+        decision: what became of it. reason: why, in words.
+        gain, gain_error: elpd of held-out data after less before, and its block standard error
+            [nats]; NaN where it was not refitted.
+        seconds: that refits took.
+    """
+
+    round: int
+    evidence: Evidence
+    q_value: float
+    decision: Decision
+    reason: str
+    gain: float = np.nan
+    gain_error: float = np.nan
+    seconds: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """Name of the effect."""
+        return self.evidence.effect
+
+
+@dataclass(frozen=True, eq=False)
+class FoundEffect:
+    """An effect that was added to the model.
+
+    Attributes:
+        name: of the effect. sentence: what it is, with its size, in the units of the record.
+        p_value: of the test that named it. q_value: false discovery rate.
+        gain, gain_error: elpd of held-out data after less before [nats].
+        parameters: posterior of what the block has learnt: mean and standard deviation by name.
+        block: the model's block, in words. curve: the evidence.
+        ties: names of effects that explain the data as well.
+        experiment: which experiment would tell them apart, "" without ties.
+    """
+
+    name: str
+    sentence: str
+    p_value: float
+    q_value: float
+    gain: float
+    gain_error: float
+    parameters: Mapping[str, tuple[float, float]]
+    block: str
+    curve: Curve | None
+    ties: tuple[str, ...] = ()
+    experiment: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """Result of `close_loop`.
+
+    Attributes:
+        effects: accepted, in the order in which they were added.
+        outcome: "effects added", "nothing missing", "structure left, cause unknown" or "effects
+            added, structure left".
+        before, after: scores on the sealed block C of the model given and of the extended one, both
+            fitted to A and B: rmse, mae, nrmse, crps, coverage_50, coverage_95.
+        elpd_gain, elpd_gain_error: elpd on C after less before, block standard error [nats].
+        fit: the extended fit (the model given where nothing was added), of A and B.
+        base: the model given, fitted to A and B.
+        attempts: all that was considered. warnings: sentences for the reader.
+        data: which part was for what. tests: p-value of each test on C before and after, by effect.
+        sealed: block C. known: blocks A and B.
+        forecast_before, forecast_after: of C.
+        model_before, model_after: the models in words, a line for each part.
+        seconds: by stage.
+    """
+
+    effects: tuple[FoundEffect, ...]
+    outcome: str
+    before: Mapping[str, float]
+    after: Mapping[str, float]
+    elpd_gain: float
+    elpd_gain_error: float
+    fit: Fit
+    base: Fit
+    attempts: tuple[Attempt, ...]
+    warnings: tuple[str, ...]
+    data: str
+    tests: Mapping[str, tuple[float, float]]
+    sealed: Record
+    known: Record
+    forecast_before: Prediction
+    forecast_after: Prediction
+    model_before: tuple[str, ...]
+    model_after: tuple[str, ...]
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything but the fits and predictions, as JSON has it."""
+        return {
+            "outcome": self.outcome,
+            "effects": [_plain(one) for one in self.effects],
+            "before": dict(self.before),
+            "after": dict(self.after),
+            "elpd_gain": self.elpd_gain,
+            "elpd_gain_error": self.elpd_gain_error,
+            "tests": {name: list(pair) for name, pair in self.tests.items()},
+            "attempts": [_plain(one) for one in self.attempts],
+            "warnings": list(self.warnings),
+            "data": self.data,
+            "model_before": list(self.model_before),
+            "model_after": list(self.model_after),
+            "seconds": dict(self.seconds),
+        }
+
+    def to_json(self, path: str | Path) -> None:
+        """Write `to_dict` to a file; numbers that are not finite become null."""
+        text = json.dumps(_finite(self.to_dict()), indent=1, allow_nan=False)
+        Path(path).write_text(text + "\n", encoding="utf-8")
+
+    def to_html(self, path: str | Path) -> None:
+        """Write one self-contained page, figures inside."""
+        from pyro_dynogp.discrepancy.page import page
+
+        Path(path).write_text(page(self), encoding="utf-8")
+
+    def __str__(self) -> str:
+        lines = [f"{self.outcome[:1].upper()}{self.outcome[1:]}."]
+        lines += [f"{k}. {one.name}: {one.sentence}" for k, one in enumerate(self.effects, 1)]
+        for one in self.effects:
+            if one.ties:
+                lines.append(f"   {one.name} or {', '.join(one.ties)}: {one.experiment}")
+        lines.append(self.data)
+        for name in self.before:
+            pair = f"before {self.before[name]:.4g}, after {self.after[name]:.4g}"
+            lines.append(f"{name:<12} {pair}")
+        gain, error = self.elpd_gain, self.elpd_gain_error
+        lines.append(f"elpd         after less before {gain:.1f} +- {error:.1f} nats")
+        return "\n".join([*lines, *self.warnings])
+
+
+def _plain(one: Any) -> Any:
+    """Dataclasses, arrays and mappings as JSON has them."""
+    if isinstance(one, Attempt | FoundEffect | Evidence | Curve):
+        return {name: _plain(getattr(one, name)) for name in one.__dataclass_fields__}
+    if isinstance(one, np.ndarray):
+        return one.tolist()
+    if isinstance(one, Mapping):
+        return {str(k): _plain(v) for k, v in one.items()}
+    if isinstance(one, Sequence) and not isinstance(one, str):
+        return [_plain(v) for v in one]
+    if isinstance(one, np.generic):
+        return one.item()
+    return one
+
+
+def _finite(one: Any) -> Any:
+    """With null for numbers that JSON does not have."""
+    if isinstance(one, dict):
+        return {k: _finite(v) for k, v in one.items()}
+    if isinstance(one, list):
+        return [_finite(v) for v in one]
+    if isinstance(one, float) and not np.isfinite(one):
+        return None
+    return one

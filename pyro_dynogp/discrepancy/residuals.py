@@ -1,0 +1,95 @@
+"""Residuals of a fit along a record, with all that the tests look at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pyro_dynogp._errors import invalid
+from pyro_dynogp.channels import count_direct
+from pyro_dynogp.criticism.posterior_draws import draws_of, with_draws
+from pyro_dynogp.discrepancy.evidence import Residuals
+from pyro_dynogp.models.cascade import Cascade
+from pyro_dynogp.record import Record
+
+if TYPE_CHECKING:
+    from pyro_dynogp.inference.result import Fit
+
+# Time constants until a simulation has settled, and the share of a record that may be lost to it.
+SETTLED, LOST = 4.0, 0.1
+# Posterior draws that say what the uncertainty of the parameters leaves in a residual.
+DRAWS = 48
+
+
+def residuals_of(
+    fit: Fit,
+    record: Record,
+    *,
+    held_out: np.ndarray | None = None,
+    candidates: Sequence[str] = (),
+    output: int = 0,
+    seed: int = 0,
+) -> Residuals:
+    """Simulation residuals and innovations of one output, in the units of the record.
+
+    The output counts as missing until the simulation, whose first state is unknown, has settled.
+
+    Args:
+        fit: the fit. record: along which, in one piece.
+        held_out: (n,) True where the fit has not seen the output; by default everywhere.
+        candidates: names of extra channels that may act.
+        output: which one. seed: of posterior draws.
+
+    Raises:
+        ValueError: where a candidate is no extra channel of the record.
+    """
+    for name in candidates:
+        if name not in record.extra:
+            raise invalid(
+                "candidates", expected=f"extra channels {list(record.extra)}", got=repr(name)
+            )
+    prepared = fit.model.check(record)[0]
+    linear = not isinstance(fit.model, Cascade)
+    if fit.method == "map":
+        drawn = draws_of(fit, count=DRAWS, seed=seed, anneal=False)
+        spread = with_draws(fit, drawn.values)
+    else:
+        spread = fit
+    options = {} if linear else {"process_noise": False}
+    mean = fit.simulate(prepared, seed=seed, **options).mean[:, output]
+    component = spread.simulate(prepared, seed=seed, samples=DRAWS, **options).component_mean
+    chosen = np.linspace(0, len(component) - 1, min(DRAWS, len(component))).astype(int)
+    deviations = component[chosen][:, :, output]
+    driving = prepared.n_inputs - count_direct(fit.model.channels)
+    y = record.outputs[:, output].copy()
+    y[: settling(fit, record)] = np.nan
+    return Residuals(
+        time=record.time,
+        output=y,
+        mean=mean,
+        deviations=deviations - deviations.mean(0),
+        innovations=fit.innovations(prepared)[:, output],
+        inputs=prepared.inputs[:, :driving],
+        input_names=prepared.input_names[:driving],
+        candidates={name: record.extra[name] for name in candidates},
+        held_out=np.ones(len(record), dtype=bool) if held_out is None else held_out,
+        output_name=record.output_names[output],
+        output_unit=record.output_units[output],
+        time_unit=record.time_unit,
+        step=record.sampling_time,
+        stamps=record.timestamps,
+    )
+
+
+def settling(fit: Fit, record: Record) -> int:
+    """Samples until what the first state left in a simulation has died away."""
+    system = fit._system_at(fit.mode)
+    layers = system.layers if isinstance(fit.model, Cascade) else [system]
+    modes = [layer.modes for layer in layers if hasattr(layer, "modes")]
+    if not modes:
+        return 0
+    slowest = min(float(-one.poles.real.max()) for one in modes)
+    count = SETTLED / max(slowest * record.sampling_time, 1e-9)
+    return int(min(count, LOST * len(record)))

@@ -1,0 +1,165 @@
+"""The command close-loop: what it reads, hands on, prints and writes."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+from click.testing import CliRunner
+
+import pyro_dynogp as dgp
+from pyro_dynogp.cli import main
+from tests.discrepancy import reports
+
+COLUMNS = ["--input", "valve", "--output", "level", "--sampling-time", "0.5"]
+QUICK = ["--pairs", "1", "--restarts", "1", "--workers", "1", "--quiet"]
+
+
+def run(*arguments):
+    command = ["close-loop", *map(str, arguments)]
+    return CliRunner().invoke(main, command, prog_name="pyro-dynogp")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    rng = np.random.default_rng(0)
+    n = 260
+    u = np.repeat(rng.normal(size=n // 4), 4)
+    y = np.zeros(n)
+    for k in range(1, n):
+        y[k] = 0.8 * y[k - 1] + 0.3 * u[k - 1]
+    frame = pd.DataFrame(
+        {
+            "stamp": pd.date_range("2024-01-01", periods=n, freq="500ms", tz="UTC").map(
+                pd.Timestamp.isoformat
+            ),
+            "valve": u,
+            "level": y + 0.05 * rng.normal(size=n),
+            "ambient": rng.normal(size=n),
+            "feed": rng.normal(size=n),
+            "shift": "day",
+            "spare": "",
+        }
+    )
+    path = tmp_path_factory.mktemp("close_loop")
+    frame.to_csv(path / "plant.csv", index=False)
+    frame[:200].to_csv(path / "short.csv", index=False)
+    return path
+
+
+@pytest.fixture
+def seen(monkeypatch):
+    """What the command hands to `close_loop`, which is replaced."""
+    handed = {}
+
+    def close_loop(fit, record, *, candidates=None, seed=0, max_rounds=4, **options):
+        handed.update(
+            options, fit=fit, record=record, candidates=candidates, seed=seed, rounds=max_rounds
+        )
+        return reports.report(fit=fit, base=fit)
+
+    monkeypatch.setattr(dgp, "close_loop", close_loop, raising=False)
+    return handed
+
+
+@pytest.fixture
+def unfitted(monkeypatch):
+    """Models that the command fits, without the work."""
+    models = []
+
+    def fit(model, record, **options):
+        models.append((model, record, options))
+        return SimpleNamespace(save=lambda path: path.write_bytes(b"fit"))
+
+    monkeypatch.setattr(dgp, "fit", fit)
+    return models
+
+
+def test_end_to_end(folder, seen, tmp_path):
+    out = tmp_path / "a" / "report"
+    result = run(
+        folder / "plant.csv", *COLUMNS, *QUICK, "--unit", "level=m", "--unit", "ambient=K",
+        "--seed", 3, "--max-rounds", 2, "--out", out,
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    record, fitted = seen["record"], seen["fit"]
+    assert len(record) == 260
+    assert (record.input_names, record.output_names) == (("valve",), ("level",))
+    assert record.output_units == ("m",)
+    assert tuple(record.extra) == ("ambient", "feed")
+    assert dict(record.extra_units) == {"ambient": "K", "feed": ""}
+    assert fitted.training == (record[:130].fingerprint,)
+    assert fitted.model.pairs == 1
+    assert (seen["seed"], seen["rounds"], seen["candidates"]) == (3, 2, None)
+    assert (seen["workers"], seen["progress"]) == (1, False)
+    report = reports.report(fit=fitted, base=fitted)
+    assert str(report) in result.stdout
+    assert "stamp, shift, spare" in result.stderr
+    assert (out / "report.html").read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+    assert json.loads((out / "report.json").read_text())["outcome"] == "effects added"
+    assert dgp.load(out / "model.safetensors").training == fitted.training
+    for name in ("report.html", "report.json", "model.safetensors"):
+        assert str(out / name) in result.stdout
+
+
+def test_named_candidates_and_time_stamps(folder, seen, unfitted, tmp_path):
+    result = run(
+        folder / "plant.csv", "--input", "valve", "--output", "level", "--time", "stamp",
+        "--candidates", "feed", "--model", "wiener", "--pairs", 2, "--out", tmp_path, "--seed", 5,
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    assert tuple(seen["record"].extra) == ("feed",)
+    assert seen["record"].timestamps is not None
+    assert result.stderr == ""
+    ((model, record, options),) = unfitted
+    assert model == dgp.Wiener(inputs=1, outputs=1, pairs=2)
+    assert len(record) == 130
+    assert options["seed"] == 5
+    assert (tmp_path / "model.safetensors").read_bytes() == b"fit"
+
+
+def test_a_data_set(seen, unfitted, tmp_path):
+    result = run("gas_furnace", "--out", tmp_path)
+    assert result.exit_code == 0, result.output
+    assert len(seen["record"]) == 296
+    assert len(unfitted[0][1]) == 148
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["plant.csv", "--input", "valve", "--sampling-time", "1"], ["--output", "info"]),
+        (["plant.csv", "--input", "valve", "--output", "level"], ["--time", "--sampling-time"]),
+        (["plant.csv", *COLUMNS, "--candidates", "valve"], ["--candidates", "'valve'"]),
+        (["plant.csv", *COLUMNS, "--candidates", "wind"], ["'ambient'", "'wind'"]),
+        (["plant.csv", *COLUMNS, "--candidates", "shift"], ["column 'shift'", "'day' in line 2"]),
+        (["plant.csv", *COLUMNS, "--unit", "wind=m/s"], ["--unit", "'wind=m/s'"]),
+        (["short.csv", *COLUMNS], ["short.csv", "200 samples", "240"]),
+        (["missing.csv", *COLUMNS], ["missing.csv", "neither a file"]),
+        (["plant.csv", *COLUMNS, "--model", "hammer"], ["--model", "wiener"]),
+        (["plant.csv", *COLUMNS, "--max-rounds", "0"], ["--max-rounds"]),
+        (["plant.csv", *COLUMNS, "--out", "plant.csv"], ["--out"]),
+        (["wh_process_noise"], ["wh_process_noise", "one record"]),
+        (["gas_furnace", "--candidates", "wind"], ["--candidates", "wind"]),
+        (["gas_furnace", "--sampling-time", "1"], ["--sampling-time", "gas_furnace"]),
+    ],
+)  # fmt: skip
+def test_refuses(arguments, parts, folder, seen, monkeypatch):
+    monkeypatch.chdir(folder)
+    result = run(*arguments)
+    assert result.exit_code == 2, result.output
+    assert result.stdout == ""
+    last = result.stderr.strip().splitlines()[-1]
+    assert last.startswith("Error: ")
+    for part in parts:
+        assert part in last
+    assert not seen
+    assert not (folder / "close_loop_output").exists()
+
+
+def test_help_has_examples():
+    result = run("--help")
+    assert result.exit_code == 0
+    assert "Examples:\n    pyro-dynogp close-loop " in result.stdout
+    assert max(map(len, result.stdout.splitlines())) <= 100
