@@ -57,8 +57,9 @@ def close_loop(
     discovery rate below `level` for one effect); if so, effects whose test rejects at `level`, and
     their nearest relatives, are added to the model one at a time and fitted to A; the one that
     raises the log-density of held-out data most is kept if it does so by more than two block
-    standard errors and 4 nats. Of effects that explain as much the one that leaves least open is
-    kept, and the others are reported as ties. Rounds end where nothing is left, or nothing helps.
+    standard errors and 4 nats, effects between inputs and output before those of the noise, which
+    their lack imitates. Of effects that explain as much the one that leaves least open is kept, and
+    the others are reported as ties. Rounds end where nothing is left, or nothing helps.
 
     Args:
         fit: a fit to one record.
@@ -113,7 +114,10 @@ def close_loop(
         accepted.append((confirmed.winner, confirmed))
         model = confirmed.model
         current = quick_fit(model, data.known[:begin], poles_of(current), seed)
-        left = False
+    else:  # rounds are spent; whether something is left is still to be said
+        residuals, found, _ = state.look(current, {one.effect.name for one, _ in accepted})
+        left = state.structure(residuals, found)
+        clock.next("residual tests")
     fits = [first, current] if accepted else [first]
     fitted = _final(fits, data.known, workers, progress)
     base, extended = fitted[0], fitted[-1]

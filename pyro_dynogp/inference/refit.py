@@ -26,26 +26,17 @@ from pyro_dynogp.record import Record
 LINEAR_STEPS, CASCADE_STEPS, SVI_STEPS = 300, 200, 400
 # Adam's first step: the old optimum is close by.
 REFIT_RATE = 0.004
-# Draws of a posterior where there was a mode alone.
-DRAWS = 200
 # Of NUTS, whose chains start at the mode.
 WARMUP = 300
 
 
-def refit(
-    fit: Fit,
-    records: Record | Sequence[Record],
-    *,
-    hyperparameters: Hyperparameters | None = None,
-) -> Fit:
+def refit(fit: Fit, records: Record | Sequence[Record]) -> Fit:
     """Fit again by the same method, beginning at the optima of the old fit, in this process.
 
     The scaling, and with it every prior, stays that of the old fit: what changes is the data alone.
 
     Args:
         fit: the old fit. records: as many as it has, each with the same channels.
-        hyperparameters: of a posterior mode ("map"): go on to a variational posterior of this
-            family, see `pyro_dynogp.fit`; None stays at the mode.
 
     Raises:
         ValueError: on a fit with trajectories as sites, whose guide belongs to its record, or on
@@ -82,13 +73,13 @@ def refit(
         "records": several,
         "trajectories": {},
     }
-    if fit.method == "map" and hyperparameters is None:
+    if fit.method == "map":
         draws = {name: value.unsqueeze(0) for name, value in best.values.items()}
         return replace(fit, draws=MappingProxyType(draws), **changed)
     if fit.method == "nuts":
         draws = _sampled(fit, target, argument, best)
         return replace(fit, draws=MappingProxyType(draws), **changed)
-    family = hyperparameters or _family(fit)
+    family = _family(fit)
     found = posterior_of(
         target,
         argument,
@@ -103,8 +94,7 @@ def refit(
         progress=False,
     )
     changed |= {"mode": MappingProxyType(dict(found.mode)), "history": found.elbo}
-    changed["method"] = "svi"
-    count = max(len(next(iter(fit.draws.values()))), DRAWS if fit.method == "map" else 1)
+    count = len(next(iter(fit.draws.values())))
     with seeded(fit.seed):
         draws = draws_of_guide(found.guide, argument, count, best.values)
     return replace(fit, draws=MappingProxyType(draws), posterior=found.guide, **changed)
