@@ -9,6 +9,7 @@ import numpy as np
 
 from pyro_dynogp._errors import invalid
 from pyro_dynogp.record import Record
+from pyro_dynogp.signals import held
 
 
 @dataclass(frozen=True)
@@ -70,11 +71,9 @@ def signal_of(record: Record, name: str) -> np.ndarray:
         known = [*record.input_names, *record.extra]
         raise invalid("record", expected=f"a channel {name!r}", got=f"channels {known}")
     x = record.extra[name]
-    there = np.isfinite(x)
-    if not there.any():
+    if not np.isfinite(x).any():
         raise invalid(f"channel {name!r}", expected="numbers", got="missing samples alone")
-    last = np.maximum.accumulate(np.where(there, np.arange(len(x)), -1))
-    return x[np.where(last < 0, int(np.argmax(there)), last)]
+    return held(x)
 
 
 def unit_of(record: Record, name: str) -> str:

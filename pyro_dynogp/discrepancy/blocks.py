@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pyro_dynogp._errors import invalid
-from pyro_dynogp.prediction.clock import gap_between
+from pyro_dynogp.prediction.clock import gap_between, joined
 from pyro_dynogp.record import Record
 
 if TYPE_CHECKING:
@@ -146,20 +146,3 @@ def _joined(training: Record, later: Record, shift: float) -> Record:
         raise invalid("record", expected=f"inputs among {inputs}", got=f"{lost}")
     before = training.select(inputs=later.input_names)
     return joined(before, later, shift)
-
-
-def joined(first: Record, second: Record, shift: float = 0.0) -> Record:
-    """Two records with the same channels, one after the other, on the clock of the first.
-
-    Args:
-        first, second: the records. shift: subtracted from the times of the second.
-    """
-    names = [name for name in second.extra if name in first.extra]
-    return dataclasses.replace(
-        first,
-        time=np.concatenate([first.time, second.time - shift]),
-        inputs=np.concatenate([first.inputs, second.inputs]),
-        outputs=np.concatenate([first.outputs, second.outputs]),
-        extra={name: np.concatenate([first.extra[name], second.extra[name]]) for name in names},
-        extra_units={name: second.extra_units[name] for name in names},
-    )

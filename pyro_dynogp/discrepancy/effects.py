@@ -16,7 +16,7 @@ such a class and give it to `close_loop` among `effects`:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import ClassVar
 
@@ -99,6 +99,7 @@ class Effect:
             whole record rather than after it.
         score: on which densities it must pay: of forecasts, or one step ahead.
         once: whether it is not looked for again in a model that has it.
+        test: finds evidence in residuals; a class whose test needs more overrides `detect`.
     """
 
     name: ClassVar[str] = ""
@@ -107,10 +108,11 @@ class Effect:
     localised: ClassVar[bool] = False
     score: ClassVar[Score] = "forecast"
     once: ClassVar[bool] = False
+    test: ClassVar[Callable[..., Evidence | Sequence[Evidence]]]
 
     def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
         """Evidence for the effect, one for each channel it may come from; may be empty."""
-        raise NotImplementedError
+        return _listed(self.test(residuals, seed=seed))
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
         """Variants of the model with the effect as a block; empty where it is only reported."""
@@ -143,16 +145,20 @@ def _centre(record: Record, name: str) -> float:
     return float(np.mean(signal_of(record, name)))
 
 
+def _finer(model: Model, number: str, times: int) -> list[Model]:
+    """The model with a number of its last channel a little smaller and larger."""
+    *rest, last = model.channels
+    values = [share * getattr(last, number) for share in FINER[times]]
+    return [replace(model, channels=(*rest, replace(last, **{number: v}))) for v in values]
+
+
 class ExtraInput(Effect):
     """A recorded channel that acts: through dynamics, alone, squared, or times an input."""
 
     name = "extra input"
     family = "paths"
     freedom = 2
-
-    def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
-        """One for each candidate channel."""
-        return _listed(extra_input(residuals, seed=seed))
+    test = staticmethod(extra_input)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
         """The channel, or what is made from it, as an input; with its delay where there is one."""
@@ -218,11 +224,7 @@ class DeadTime(Effect):
 
     def refine(self, model: Model, times: int) -> Sequence[Model]:
         """The delay a little shorter and longer."""
-        return [
-            replace(model, channels=(*model.channels[:-1], replace(last, delay=share * last.delay)))
-            for share in FINER[times]
-            if isinstance(last := model.channels[-1], Delayed)
-        ]
+        return _finer(model, "delay", times)
 
 
 class UnmodelledDynamics(Effect):
@@ -231,10 +233,7 @@ class UnmodelledDynamics(Effect):
     name = "unmodelled dynamics"
     family = "paths"
     freedom = 5
-
-    def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
-        """One."""
-        return _listed(unmodelled_dynamics(residuals, seed=seed))
+    test = staticmethod(unmodelled_dynamics)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
         """One pair of poles more, or two."""
@@ -247,10 +246,7 @@ class OutputNonlinearity(Effect):
     name = "output nonlinearity"
     family = "shapes"
     freedom = 4
-
-    def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
-        """One."""
-        return _listed(output_nonlinearity(residuals, seed=seed))
+    test = staticmethod(output_nonlinearity)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
         """A static layer after the last dynamic one."""
@@ -264,10 +260,7 @@ class Saturation(OutputNonlinearity):
     name = "saturation"
     family = "shapes"
     freedom = 3
-
-    def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
-        """One."""
-        return _listed(saturation(residuals, seed=seed))
+    test = staticmethod(saturation)
 
 
 class InputNonlinearity(Effect):
@@ -276,10 +269,7 @@ class InputNonlinearity(Effect):
     name = "input nonlinearity"
     family = "shapes"
     freedom = 4
-
-    def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
-        """One for each input."""
-        return _listed(input_nonlinearity(residuals, seed=seed))
+    test = staticmethod(input_nonlinearity)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
         """A static layer before the first dynamic one."""
@@ -293,10 +283,7 @@ class DeadZoneOfInput(Effect):
     name = "dead zone"
     family = "shapes"
     freedom = 2
-
-    def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
-        """One for each input."""
-        return _listed(dead_zone(residuals, seed=seed))
+    test = staticmethod(dead_zone)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
         """The input beyond limits around the estimate."""
@@ -327,10 +314,7 @@ class Hysteresis(Effect):
     name = "hysteresis"
     family = "shapes"
     freedom = 2
-
-    def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
-        """One for each input, and for the output."""
-        return _listed(hysteresis(residuals, seed=seed))
+    test = staticmethod(hysteresis)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
         """The input behind play of widths around the estimate; play of a sensor is reported."""
@@ -341,11 +325,7 @@ class Hysteresis(Effect):
 
     def refine(self, model: Model, times: int) -> Sequence[Model]:
         """The play a little narrower and wider."""
-        return [
-            replace(model, channels=(*model.channels[:-1], replace(last, width=share * last.width)))
-            for share in FINER[times]
-            if isinstance(last := model.channels[-1], Play)
-        ]
+        return _finer(model, "width", times)
 
 
 class Drift(Effect):
@@ -353,10 +333,7 @@ class Drift(Effect):
 
     name = "drift"
     family = "time"
-
-    def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
-        """Of the level, and of the gain."""
-        return _listed(drift(residuals, seed=seed))
+    test = staticmethod(drift)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
         """A straight line in time, or each input times it."""
@@ -379,10 +356,7 @@ class LevelShift(Effect):
     name = "level shift"
     family = "time"
     localised = True
-
-    def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
-        """One."""
-        return _listed(level_shift(residuals, seed=seed))
+    test = staticmethod(level_shift)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
         """A step at the instant."""
@@ -394,10 +368,7 @@ class PeriodicDisturbance(Effect):
 
     name = "periodic disturbance"
     family = "time"
-
-    def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
-        """One."""
-        return _listed(periodic_disturbance(residuals, seed=seed))
+    test = staticmethod(periodic_disturbance)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
         """A sinusoid of the period, and of periods within its resolution."""
@@ -487,10 +458,7 @@ class HeavyTails(Effect):
     once = True
     score = "one step"
     family = "noise"
-
-    def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
-        """One."""
-        return _listed(heavy_tails(residuals, seed=seed))
+    test = staticmethod(heavy_tails)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
         """Student-t measurement noise."""
@@ -506,10 +474,7 @@ class HeteroscedasticNoise(Effect):
     score = "one step"
     family = "noise"
     freedom = 3
-
-    def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
-        """One for each driver."""
-        return _listed(heteroscedastic_noise(residuals, seed=seed))
+    test = staticmethod(heteroscedastic_noise)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
         """Log standard deviation of the noise as a Gaussian process of the inputs."""
@@ -525,10 +490,7 @@ class ProcessNoise(Effect):
     score = "one step"
     family = "paths"
     freedom = 6
-
-    def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
-        """One."""
-        return _listed(process_noise(residuals, seed=seed))
+    test = staticmethod(process_noise)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
         """Process noise in every dynamic layer; where it is there, more poles are for dynamics."""
@@ -543,10 +505,7 @@ class Feedback(Effect):
 
     name = "feedback"
     family = "feedback"
-
-    def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
-        """One for each input."""
-        return _listed(feedback(residuals, seed=seed))
+    test = staticmethod(feedback)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
         """Nothing: it is reported."""

@@ -14,7 +14,7 @@ from pyro_dynogp.channels import count_direct
 from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.criticism.posterior_draws import draws_of
 from pyro_dynogp.discrepancy import words
-from pyro_dynogp.discrepancy.blocks import Blocks, blocks_of, joined
+from pyro_dynogp.discrepancy.blocks import Blocks, blocks_of
 from pyro_dynogp.discrepancy.effects import CATALOGUE, Effect
 from pyro_dynogp.discrepancy.evidence import Residuals
 from pyro_dynogp.discrepancy.extend import Model, used_channels
@@ -25,9 +25,11 @@ from pyro_dynogp.discrepancy.residuals import residuals_of
 from pyro_dynogp.discrepancy.search import Confirmed, Found, candidates_of, confirm, look
 from pyro_dynogp.discrepancy.trials import one_step_density, poles_of, quick_fit
 from pyro_dynogp.inference.fit import fit as fit_model
+from pyro_dynogp.inference.result import Method
 from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.layers import Static
 from pyro_dynogp.parallel import parallel_map
+from pyro_dynogp.prediction.clock import joined
 from pyro_dynogp.prediction.scores import scores
 from pyro_dynogp.record import Record
 
@@ -122,9 +124,7 @@ def close_loop(
     fitted = _final(fits, data.known, workers, progress)
     base, extended = fitted[0], fitted[-1]
     clock.next("last fits")
-    return _report(
-        fit, base, extended, data, state, accepted, attempts, warnings, left, clock.seconds
-    )
+    return _report(base, extended, data, state, accepted, attempts, warnings, left, clock.seconds)
 
 
 class _Clock:
@@ -253,14 +253,13 @@ def _final(fits: Sequence[Fit], record: Record, workers: int | None, progress: b
         functions = isinstance(model, Cascade) and any(
             isinstance(layer, Static) for layer in model.layers
         )
-        method = "svi" if functions or given.method != "map" else "map"
-        return fit_model(model, record, method=method, seed=given.seed, workers=1, progress=False)  # type: ignore[arg-type]
+        method: Method = "svi" if functions or given.method != "map" else "map"
+        return fit_model(model, record, method=method, seed=given.seed, workers=1, progress=False)
 
     return parallel_map(one, fits, workers=workers, progress=progress, description="last fits")
 
 
 def _report(
-    fit: Fit,
     base: Fit,
     extended: Fit,
     data: Blocks,
@@ -275,7 +274,7 @@ def _report(
     forecasts = [one.forecast(data.known, data.sealed, seed=state.seed) for one in (base, extended)]
     before, after = ({k: _mean(v) for k, v in scores(f, data.sealed).items() if k in SCORES}
                      for f in forecasts)  # fmt: skip
-    whole = _whole(data)
+    whole = joined(data.known, data.sealed)
     sealed = np.zeros(len(whole), dtype=bool)
     sealed[len(data.known) :] = True
     densities = [one_step_density(one, whole)[sealed] for one in (base, extended)]
@@ -283,11 +282,10 @@ def _report(
     gain = densities[1][there] - densities[0][there]
     tests: dict[str, tuple[float, float]] = {}
     if accepted:
-        pairs = [state.residuals(one, whole, sealed) for one in (base, extended)]
+        without, having = (state.residuals(one, whole, sealed) for one in (base, extended))
         for found, _ in accepted:
-            tests[found.effect.name] = tuple(  # type: ignore[assignment]
-                _smallest(found.effect, several, state.seed) for several in pairs
-            )
+            p_before = _smallest(found.effect, without, state.seed)
+            tests[found.effect.name] = p_before, _smallest(found.effect, having, state.seed)
     return Report(
         effects=tuple(_effect(f, c, extended) for f, c in accepted),
         outcome=_outcome(bool(accepted), left),
@@ -311,11 +309,6 @@ def _report(
     )
 
 
-def _whole(data: Blocks) -> Record:
-    """All three blocks in one piece again."""
-    return joined(data.known, data.sealed)
-
-
 def _outcome(added: bool, left: bool) -> str:
     if added:
         return "effects added, structure left" if left else "effects added"
@@ -329,9 +322,8 @@ def _smallest(effect: Effect, residuals: Sequence[Residuals], seed: int) -> floa
 
 
 def _effect(found: Found, confirmed: Confirmed, extended: Fit) -> FoundEffect:
-    attempt, tried = confirmed.attempt, confirmed.tried
+    attempt = confirmed.attempt
     assert attempt is not None
-    assert tried is not None
     assert confirmed.model is not None
     before = len(confirmed.before.channels)
     own = confirmed.model.channels[before:]

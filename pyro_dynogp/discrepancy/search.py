@@ -108,7 +108,7 @@ class Confirmed:
 
     Attributes:
         attempts: of all candidates. winner: the one to add, None if none helps.
-        before: the model without it. model: extended by it. tried: its trial.
+        before: the model without it. model: extended by it. attempt: that of the winner.
         ties: names of effects that explain as much.
     """
 
@@ -116,7 +116,6 @@ class Confirmed:
     winner: Found | None
     before: Model
     model: Model | None
-    tried: Tried | None
     attempt: Attempt | None
     ties: tuple[str, ...]
 
@@ -194,7 +193,7 @@ def confirm(
         if good:
             better.append((one, variants, tried, attempt, key[1:]))
     if not better:
-        return Confirmed(tuple(attempts), None, model, None, None, None, ())
+        return Confirmed(tuple(attempts), None, model, None, None, ())
     # Gains of forecasts and of one step ahead do not compare: first what lies between inputs and
     # output, whose lack looks like noise, and noise when nothing of that kind is left.
     structural = [b for b in better if b[0].effect.score == "forecast"]
@@ -220,7 +219,7 @@ def confirm(
             )
         final.append(attempt)
     accepted = next(a for a in final if a.decision == "accepted")
-    return Confirmed(tuple(final), chosen[0], model, chosen[2].model, chosen[2], accepted, ties)
+    return Confirmed(tuple(final), chosen[0], model, chosen[2].model, accepted, ties)
 
 
 def _judge(one: Found, tried: Tried, base: Tried, number: int) -> tuple[Attempt, bool]:

@@ -64,13 +64,11 @@ class Tried:
     Attributes:
         model: the variant kept. densities: (N,) log-density of each output scored, fold after fold
             [nats].
-        energies: -log p(y, values) of all variants that were fitted [nats].
         seconds: it took. failure: why there is no result, "" if there is one.
     """
 
     model: Model
     densities: np.ndarray
-    energies: np.ndarray
     seconds: float
     failure: str = ""
 
@@ -81,37 +79,42 @@ def run(trial: Trial) -> Tried:
     training = without(trial.record, trial.folds[0])
     several = len(trial.models) > 1
     problems: list[str] = []
-    fitted: list[tuple[float, Model]] = []
+    fitted: list[Fit] = []
 
     def look(models: Sequence[Model]) -> None:
         for model in models:
             try:
-                found = quick_fit(model, training, trial.poles, trial.seed, short=several)
+                fitted.append(quick_fit(model, training, trial.poles, trial.seed, short=several))
             except ValueError as error:  # for instance a channel that is constant there
                 problems.append(str(error))
-            else:
-                fitted.append((float(found.start_energies[0]), model))
+
+    def best() -> Fit:
+        return min(fitted, key=lambda found: float(found.start_energies[0]))
+
+    def unscaled(found: Fit) -> Model:
+        return replace(found.model, scaling=None)
 
     look(trial.models)
     if not fitted:
-        nothing = np.zeros(0)
-        seconds = time.perf_counter() - begin
-        return Tried(trial.models[0], nothing, nothing, seconds, problems[0])
+        return Tried(trial.models[0], np.zeros(0), time.perf_counter() - begin, problems[0])
     if trial.refine is not None:
         for times in range(REFINEMENTS):
-            look(trial.refine(min(fitted, key=lambda pair: pair[0])[1], times))
-    best = min(fitted, key=lambda pair: pair[0])[1]
+            look(trial.refine(unscaled(best()), times))
+    model = unscaled(best())
     parts = []
     try:
-        for fold in trial.folds:
-            found = quick_fit(best, without(trial.record, fold), trial.poles, trial.seed)
+        for index, fold in enumerate(trial.folds):
+            if index == 0 and not several:  # fitted in full already
+                found = best()
+            else:
+                found = quick_fit(model, without(trial.record, fold), trial.poles, trial.seed)
             parts.append(held_out_density(found, trial.record, fold, trial.score))
     except ValueError as error:
         problems.append(str(error))
         parts = [np.zeros(0)]
     seconds = time.perf_counter() - begin
     failure = problems[-1] if not len(parts[0]) else ""
-    return Tried(best, np.concatenate(parts), np.array([e for e, _ in fitted]), seconds, failure)
+    return Tried(model, np.concatenate(parts), seconds, failure)
 
 
 def without(record: Record, fold: np.ndarray) -> Record:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 import pyro
 import pyro.distributions as dist
@@ -22,7 +22,13 @@ from pyro_dynogp.lti.covariance import state_covariance
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.state import ModalState
 from pyro_dynogp.models.layers import INPUTS, Dynamic, Layer, Static, Wire, wire
-from pyro_dynogp.models.linear import check_direct, initial_mean, past_input_covariance, prepare
+from pyro_dynogp.models.linear import (
+    check_direct,
+    check_records,
+    initial_mean,
+    past_input_covariance,
+    prepare,
+)
 from pyro_dynogp.models.priors import FLAT, PriorName, TimeScale, sample_direct, sample_modes
 from pyro_dynogp.record import Record
 from pyro_dynogp.scaling import Scaling
@@ -478,26 +484,6 @@ def observe_linear(
     if y is not None and not several:
         y = y[:, 0]
     pyro.sample(f"y{suffix}", physical.observed(sd), obs=y)
-
-
-def check_records(model: Any, records: Record | Sequence[Record]) -> tuple[Record, ...]:
-    """Records, prepared, whose channels and units fit a model with inputs, outputs and scaling."""
-    checked = prepare(model, records)
-    for record in checked:
-        for what, expected, got in (
-            ("inputs", model.inputs, record.n_inputs),
-            ("outputs", model.outputs, record.n_outputs or model.outputs),
-        ):
-            if expected != got:
-                raise invalid(
-                    "record",
-                    expected=f"{expected} {what}, as the model has",
-                    got=f"{got}",
-                    advice=f"Choose channels with record.select(...) or set {what}={got}.",
-                )
-        if model.scaling is not None:
-            model.scaling.check(record, outputs=record.n_outputs > 0)
-    return checked
 
 
 __all__ = ["Cascade", "CascadeSystem", "DynamicSystem", "StaticSystem"]

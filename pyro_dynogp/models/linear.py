@@ -121,22 +121,7 @@ class LinearDynamicGP:
         Raises:
             ValueError: where the number of channels or a unit differs.
         """
-        checked = prepare(self, records)
-        for record in checked:
-            for what, expected, got in (
-                ("inputs", self.inputs, record.n_inputs),
-                ("outputs", self.outputs, record.n_outputs or self.outputs),
-            ):
-                if expected != got:
-                    raise invalid(
-                        "record",
-                        expected=f"{expected} {what}, as the model has",
-                        got=f"{got}",
-                        advice=f"Choose channels with record.select(...) or set {what}={got}.",
-                    )
-            if self.scaling is not None:
-                self.scaling.check(record, outputs=record.n_outputs > 0)
-        return checked
+        return check_records(self, records)
 
     @property
     def collapsed(self) -> LinearDynamicGP:
@@ -251,6 +236,26 @@ class LinearDynamicGP:
 def prepare(model: Any, records: Record | Sequence[Record]) -> tuple[Record, ...]:
     """Records with the channels that a model makes from them."""
     return tuple(prepared(record, model.channels) for record in as_records(records))
+
+
+def check_records(model: Any, records: Record | Sequence[Record]) -> tuple[Record, ...]:
+    """Records, prepared, whose channels and units fit a model with inputs, outputs and scaling."""
+    checked = prepare(model, records)
+    for record in checked:
+        for what, expected, got in (
+            ("inputs", model.inputs, record.n_inputs),
+            ("outputs", model.outputs, record.n_outputs or model.outputs),
+        ):
+            if expected != got:
+                raise invalid(
+                    "record",
+                    expected=f"{expected} {what}, as the model has",
+                    got=f"{got}",
+                    advice=f"Choose channels with record.select(...) or set {what}={got}.",
+                )
+        if model.scaling is not None:
+            model.scaling.check(record, outputs=record.n_outputs > 0)
+    return checked
 
 
 def check_direct(inputs: int, direct: int, channels: Sequence[Channel]) -> None:

@@ -42,19 +42,29 @@ def following(fit: Fit, past: Record, future: Record) -> tuple[Record, Record]:
         return alone
     if alone[0].input_names == past.input_names:  # prepared before they were split
         return alone
-    names = [name for name in past.extra if name in future.extra]
-    both = dataclasses.replace(
-        past,
-        time=np.concatenate([past.time, past.time[-1] + gap + future.time - future.time[0]]),
-        inputs=np.concatenate([past.inputs, future.inputs]),
-        outputs=np.zeros((len(past) + len(future), 0)),
-        output_names=(),
-        output_units=(),
-        extra={name: np.concatenate([past.extra[name], future.extra[name]]) for name in names},
-        extra_units={name: past.extra_units[name] for name in names},
+    first, second = (
+        one.with_outputs(np.zeros((len(one), 0)), names=(), units=()) for one in (past, future)
     )
+    both = joined(first, second, future.time[0] - past.time[-1] - gap)
     inputs = fit.model.check(both)[0].inputs[len(past) :]
     return alone[0], dataclasses.replace(alone[1], inputs=inputs)
+
+
+def joined(first: Record, second: Record, shift: float = 0.0) -> Record:
+    """Two records with the same channels, one after the other, on the clock of the first.
+
+    Args:
+        first, second: the records. shift: subtracted from the times of the second.
+    """
+    names = [name for name in second.extra if name in first.extra]
+    return dataclasses.replace(
+        first,
+        time=np.concatenate([first.time, second.time - shift]),
+        inputs=np.concatenate([first.inputs, second.inputs]),
+        outputs=np.concatenate([first.outputs, second.outputs]),
+        extra={name: np.concatenate([first.extra[name], second.extra[name]]) for name in names},
+        extra_units={name: second.extra_units[name] for name in names},
+    )
 
 
 def gap_between(past: Record, future: Record) -> float:

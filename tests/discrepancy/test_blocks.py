@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import pyro_dynogp as dgp
-from pyro_dynogp.discrepancy.blocks import blocks_of, joined
+from pyro_dynogp.discrepancy.blocks import blocks_of
+from pyro_dynogp.prediction.clock import joined
 
 
 def record(n: int, begin: int = 0) -> dgp.Record:
