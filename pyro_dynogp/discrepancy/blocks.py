@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 FEWEST = 60
 # Shares of A and B where a record is cut anew.
 SHARES = (0.5, 0.25)
+# Stretches of B where it is shared between fit and search.
+STRETCHES = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +96,18 @@ def blocks_of(fit: Fit, record: Record, candidates: Record | None) -> Blocks:
         f"{len(record) - second}, which nothing looked at before."
     )
     return Blocks(record[:second], held_out, record[second:], refit, sentence)
+
+
+def shared(held_out: np.ndarray) -> np.ndarray:
+    """Every other stretch of the block that is searched (n,), the last one among them.
+
+    The rest of it is for the fit, where something happens that only that block shows.
+    """
+    rows = np.flatnonzero(held_out)
+    number = np.arange(len(rows)) * STRETCHES // len(rows)
+    out = np.zeros_like(held_out)
+    out[rows[number % 2 == 1]] = True
+    return out
 
 
 def with_candidates(record: Record, candidates: Record | None) -> Record:

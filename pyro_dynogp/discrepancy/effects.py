@@ -99,6 +99,7 @@ class Effect:
             whole record rather than after it.
         score: on which densities it must pay: of forecasts, or one step ahead.
         once: whether it is not looked for again in a model that has it.
+        added: whether a block mends it; False for what is only reported.
         test: finds evidence in residuals; a class whose test needs more overrides `detect`.
     """
 
@@ -108,6 +109,7 @@ class Effect:
     localised: ClassVar[bool] = False
     score: ClassVar[Score] = "forecast"
     once: ClassVar[bool] = False
+    added: ClassVar[bool] = True
     test: ClassVar[Callable[..., Evidence | Sequence[Evidence]]]
 
     def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
@@ -427,12 +429,17 @@ class ClockShift(Effect):
         return _listed(clock_shift(residuals, zones=zones, seed=seed))
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
-        """The input read at other times from the instant on."""
+        """The input, and all inputs, read at other times from the instant on."""
         channel, shift = str(evidence.where["channel"]), _number(evidence, "shift")
         times: tuple[float, ...] = (_number(evidence, "time"),)
         if "rule" in evidence.where:
             times = summers(record, str(evidence.where["rule"]))
-        return [with_channel(model, ShiftedClock(channel, shift, times))]
+        together = model
+        prepared = model.check(record)[0]
+        for name in prepared.input_names[: prepared.n_inputs - model.direct]:
+            together = with_channel(together, ShiftedClock(name, shift, times))
+        alone = with_channel(model, ShiftedClock(channel, shift, times))
+        return [alone] if together == alone else [alone, together]
 
 
 def summers(record: Record, zone: str) -> tuple[float, ...]:
@@ -505,6 +512,7 @@ class Feedback(Effect):
 
     name = "feedback"
     family = "feedback"
+    added = False
     test = staticmethod(feedback)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:

@@ -14,7 +14,8 @@ from pyro_dynogp.channels import count_direct
 from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.criticism.posterior_draws import draws_of
 from pyro_dynogp.discrepancy import words
-from pyro_dynogp.discrepancy.blocks import Blocks, blocks_of
+from pyro_dynogp.discrepancy.blocks import Blocks, blocks_of, shared
+from pyro_dynogp.discrepancy.confirm import Confirmed, confirm
 from pyro_dynogp.discrepancy.effects import CATALOGUE, Effect
 from pyro_dynogp.discrepancy.evidence import Residuals
 from pyro_dynogp.discrepancy.extend import Model, used_channels
@@ -22,8 +23,14 @@ from pyro_dynogp.discrepancy.gate import structure_left
 from pyro_dynogp.discrepancy.noise_effects import data_faults
 from pyro_dynogp.discrepancy.report import Attempt, FoundEffect, Report
 from pyro_dynogp.discrepancy.residuals import residuals_of
-from pyro_dynogp.discrepancy.search import Confirmed, Found, candidates_of, confirm, look
-from pyro_dynogp.discrepancy.trials import one_step_density, poles_of, quick_fit
+from pyro_dynogp.discrepancy.search import Found, candidates_of, look
+from pyro_dynogp.discrepancy.trials import (
+    at_mode,
+    one_step_density,
+    poles_of,
+    quick_fit,
+    without,
+)
 from pyro_dynogp.inference.fit import fit as fit_model
 from pyro_dynogp.inference.result import Method
 from pyro_dynogp.models.cascade import Cascade
@@ -36,6 +43,8 @@ from pyro_dynogp.record import Record
 if TYPE_CHECKING:
     from pyro_dynogp.inference.result import Fit
 
+# Starts of the last fit of a cascade.
+FINAL_STARTS = 4
 SCORES = ("rmse", "mae", "nrmse", "crps", "coverage_50", "coverage_95")
 
 
@@ -61,7 +70,8 @@ def close_loop(
     raises the log-density of held-out data most is kept if it does so by more than two block
     standard errors and 4 nats, effects between inputs and output before those of the noise, which
     their lack imitates. Of effects that explain as much the one that leaves least open is kept, and
-    the others are reported as ties. Rounds end where nothing is left, or nothing helps.
+    the others are reported as ties. Rounds end where nothing is left, or nothing helps. An effect
+    that no block mends (feedback) is among the report's effects, after those that were added.
 
     Args:
         fit: a fit to one record.
@@ -85,15 +95,16 @@ def close_loop(
     other = candidates if isinstance(candidates, Record) else None
     data = blocks_of(fit, record, other)
     names = _names(fit, data.known, candidates)
-    begin = int(np.argmax(data.held_out))
     poles = poles_of(fit)
-    first = quick_fit(fit.model, data.known[:begin], poles, seed) if data.refit else fit
+    training = without(data.known, data.held_out)
+    first = quick_fit(fit.model, training, poles, seed) if data.refit else at_mode(fit)
     current = first
     clock.next("fit of block A")
     state = _State(data, names, seed, level, tries, effects, workers, progress)
     model: Model = replace(fit.model, scaling=None)
     attempts: list[Attempt] = []
     accepted: list[tuple[Found, Confirmed]] = []
+    reported: list[Found] = []
     warnings: list[str] = []
     left = False
     for number in range(1, max_rounds + 1):
@@ -102,20 +113,26 @@ def close_loop(
         clock.next("residual tests")
         if number == 1:
             warnings += [*_faults(residuals, data.known), *skipped]
-        warnings += _reported(found, level, warnings)
+            reported = [f for f in found if not f.effect.added and f.q_value <= level]
         left = state.structure(residuals, found)
         chosen = candidates_of(found, model, data.known, level, tries) if left else []
         attempts += _untried(found, chosen, level, number)
         if not chosen:
             break
-        confirmed = state.confirm(chosen, model, poles_of(current), number)
+        confirmed = state.confirm(chosen, current, number)
         clock.next("refits")
         attempts += confirmed.attempts
         if confirmed.winner is None or confirmed.model is None:
             break
         accepted.append((confirmed.winner, confirmed))
         model = confirmed.model
-        current = quick_fit(model, data.known[:begin], poles_of(current), seed)
+        again = state.hold_out_less(confirmed.winner)
+        if confirmed.fit is not None and not again:
+            current = confirmed.fit
+        else:
+            training = without(data.known, state.held_out)
+            current = quick_fit(model, training, poles_of(current), seed, current)
+        clock.next("refits")
     else:  # rounds are spent; whether something is left is still to be said
         residuals, found, _ = state.look(current, {one.effect.name for one, _ in accepted})
         left = state.structure(residuals, found)
@@ -124,7 +141,9 @@ def close_loop(
     fitted = _final(fits, data.known, workers, progress)
     base, extended = fitted[0], fitted[-1]
     clock.next("last fits")
-    return _report(base, extended, data, state, accepted, attempts, warnings, left, clock.seconds)
+    return _report(
+        base, extended, state, accepted, reported, attempts, warnings, left, clock.seconds
+    )
 
 
 class _Clock:
@@ -141,7 +160,7 @@ class _Clock:
 
 
 class _State:
-    """What stays the same in all rounds."""
+    """What rounds have in common."""
 
     def __init__(
         self,
@@ -155,6 +174,7 @@ class _State:
         progress: bool,
     ) -> None:
         self.data, self.names, self.seed = data, names, seed
+        self.held_out = data.held_out
         self.level, self.tries, self.effects = level, tries, effects
         self.workers, self.progress = workers, progress
 
@@ -170,20 +190,28 @@ class _State:
         self, fit: Fit, known: Collection[str]
     ) -> tuple[list[Residuals], list[Found], list[str]]:
         """Residuals, evidence of all effects but those that are known, what was not tested."""
-        residuals = self.residuals(fit, self.data.known, self.data.held_out)
+        residuals = self.residuals(fit, self.data.known, self.held_out)
         effects = [e for e in self.effects if not (e.once and e.name in known)]
         found, skipped = look(
             residuals, effects, seed=self.seed, workers=self.workers, progress=self.progress
         )
         return residuals, found, skipped
 
-    def confirm(
-        self, chosen: Any, model: Model, poles: np.ndarray | None, number: int
-    ) -> Confirmed:
+    def confirm(self, chosen: Any, current: Fit, number: int) -> Confirmed:
         return confirm(
-            chosen, model, self.data.known, self.data.held_out, poles, number=number,
-            seed=self.seed, workers=self.workers, progress=self.progress,
+            chosen, current, self.data.known, self.held_out, poles_of(current), number=number,
+            seed=self.seed, level=self.level, workers=self.workers, progress=self.progress,
         )  # fmt: skip
+
+    def hold_out_less(self, winner: Found) -> bool:
+        """Give parts of B to the fit where an effect begins there; whether that was needed."""
+        if not winner.effect.localised or (self.held_out != self.data.held_out).any():
+            return False
+        begin = self.data.known.time[int(np.argmax(self.held_out))]
+        if float(winner.evidence.where.get("time", -np.inf)) < begin:
+            return False
+        self.held_out = shared(self.held_out)
+        return True
 
     def structure(self, residuals: Sequence[Residuals], found: Sequence[Found]) -> bool:
         """Whether anything is left: by the omnibus test, or by one of the others, all paid for."""
@@ -216,14 +244,6 @@ def _names(fit: Fit, record: Record, candidates: Sequence[str] | Record | None) 
     return sorted(set(names) - used_channels(fit.model))
 
 
-def _reported(found: Sequence[Found], level: float, known: Sequence[str]) -> list[str]:
-    """Effects that are not fixed, only said."""
-    texts = [
-        f.evidence.sentence for f in found if f.effect.name == "feedback" and f.q_value <= level
-    ]
-    return [text for text in texts if text not in known]
-
-
 def _untried(
     found: Sequence[Found], chosen: Sequence[tuple[Found, Any]], level: float, number: int
 ) -> list[Attempt]:
@@ -232,9 +252,9 @@ def _untried(
     return [
         Attempt(
             number, f.evidence, f.q_value,
-            "reported" if f.effect.name == "feedback" else "not tried",
-            "is reported, not added" if f.effect.name == "feedback"
-            else "others are more probable, or no block of the model stands for it",
+            "not tried" if f.effect.added else "reported",
+            "others are more probable, or no block of the model stands for it" if f.effect.added
+            else "is reported, not added",
         )
         for f in found
         if f.q_value <= level and not any(f is one for one in tried)
@@ -254,7 +274,10 @@ def _final(fits: Sequence[Fit], record: Record, workers: int | None, progress: b
             isinstance(layer, Static) for layer in model.layers
         )
         method: Method = "svi" if functions or given.method != "map" else "map"
-        return fit_model(model, record, method=method, seed=given.seed, workers=1, progress=False)
+        return fit_model(
+            model, record, method=method, restarts=FINAL_STARTS if functions else None,
+            seed=given.seed, workers=1, progress=False,
+        )  # fmt: skip
 
     return parallel_map(one, fits, workers=workers, progress=progress, description="last fits")
 
@@ -262,15 +285,16 @@ def _final(fits: Sequence[Fit], record: Record, workers: int | None, progress: b
 def _report(
     base: Fit,
     extended: Fit,
-    data: Blocks,
     state: _State,
     accepted: Sequence[tuple[Found, Confirmed]],
+    reported: Sequence[Found],
     attempts: Sequence[Attempt],
     warnings: Sequence[str],
     left: bool,
     seconds: Mapping[str, float],
 ) -> Report:
     """Open block C, once."""
+    data = state.data
     forecasts = [one.forecast(data.known, data.sealed, seed=state.seed) for one in (base, extended)]
     before, after = ({k: _mean(v) for k, v in scores(f, data.sealed).items() if k in SCORES}
                      for f in forecasts)  # fmt: skip
@@ -287,7 +311,10 @@ def _report(
             p_before = _smallest(found.effect, without, state.seed)
             tests[found.effect.name] = p_before, _smallest(found.effect, having, state.seed)
     return Report(
-        effects=tuple(_effect(f, c, extended) for f, c in accepted),
+        effects=(
+            *(_effect(f, c, extended) for f, c in accepted),
+            *(_only_reported(f) for f in reported),
+        ),
         outcome=_outcome(bool(accepted), left),
         before=before,
         after=after,
@@ -327,7 +354,7 @@ def _effect(found: Found, confirmed: Confirmed, extended: Fit) -> FoundEffect:
     assert confirmed.model is not None
     before = len(confirmed.before.channels)
     own = confirmed.model.channels[before:]
-    block = words.in_words(own[0]) if own else "; ".join(words.describe(confirmed.model))
+    lines = [words.in_words(one) for one in own] or words.describe(confirmed.model)
     return FoundEffect(
         name=found.effect.name,
         sentence=found.effect.sentence(found.evidence, confirmed.model),
@@ -336,10 +363,24 @@ def _effect(found: Found, confirmed: Confirmed, extended: Fit) -> FoundEffect:
         gain=attempt.gain,
         gain_error=attempt.gain_error,
         parameters=_weights(extended, own),
-        block=block,
+        block="; ".join(lines),
         curve=found.evidence.curve,
         ties=confirmed.ties,
         experiment=words.experiment(found.effect.name, confirmed.ties),
+    )
+
+
+def _only_reported(found: Found) -> FoundEffect:
+    return FoundEffect(
+        name=found.effect.name,
+        sentence=found.evidence.sentence,
+        p_value=found.evidence.p_value,
+        q_value=found.q_value,
+        gain=0.0,
+        gain_error=0.0,
+        parameters={},
+        block="",
+        curve=found.evidence.curve,
     )
 
 

@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
 from scipy.special import logsumexp
+from torch import Tensor
 
 from pyro_dynogp.criticism.densities import pointwise_log_density
 from pyro_dynogp.discrepancy.extend import Model
-from pyro_dynogp.inference.fit import fit as fit_model
-from pyro_dynogp.inference.maximum import maximise
+from pyro_dynogp.inference.cascade_fit import starting_points
+from pyro_dynogp.inference.checkpoints import NOTHING_KEPT
+from pyro_dynogp.inference.maximum import Optimum, maximise
 from pyro_dynogp.inference.result import Fit
 from pyro_dynogp.inference.starts import random_poles, starting_values, values_given_poles
 from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.collapsed import collapsed_of
+from pyro_dynogp.models.layers import Static
 from pyro_dynogp.models.linear import LinearDynamicGP
 from pyro_dynogp.prediction.beginning import beginning
 from pyro_dynogp.prediction.linear import prior_process
@@ -28,7 +30,9 @@ from pyro_dynogp.record import Record
 # Work spent on a refit: iterations and fresh starts beside the warm one, of linear models and of
 # cascades.
 LINEAR_STEPS, LINEAR_STARTS = 120, 2
-CASCADE_STEPS, CASCADE_STARTS = 400, 6
+CASCADE_STEPS, CASCADE_STARTS = 300, 4
+# Blocks of a record on which effects of one instant are scored, every other one at a time.
+BLOCKS = 12
 Score = Literal["one step", "forecast"]
 # How often the best variant is refined.
 REFINEMENTS = 2
@@ -46,6 +50,8 @@ class Trial:
         poles: (P,) of the model that is extended [1/time unit], to start from; none for a cascade.
         seed: of fresh starts.
         score: what densities are of, see `held_out_density`.
+        fit: of a single model to the first fold's training data, where there is one already.
+        base: fit of the model that is extended, to start from; None for fresh starts alone.
     """
 
     models: tuple[Model, ...]
@@ -55,6 +61,8 @@ class Trial:
     seed: int
     score: Score = "one step"
     refine: Callable[[Model, int], Sequence[Model]] | None = None
+    fit: Fit | None = None
+    base: Fit | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,12 +73,14 @@ class Tried:
         model: the variant kept. densities: (N,) log-density of each output scored, fold after fold
             [nats].
         seconds: it took. failure: why there is no result, "" if there is one.
+        fit: of the model to the first fold's training data.
     """
 
     model: Model
     densities: np.ndarray
     seconds: float
     failure: str = ""
+    fit: Fit | None = None
 
 
 def run(trial: Trial) -> Tried:
@@ -84,7 +94,10 @@ def run(trial: Trial) -> Tried:
     def look(models: Sequence[Model]) -> None:
         for model in models:
             try:
-                fitted.append(quick_fit(model, training, trial.poles, trial.seed, short=several))
+                found = quick_fit(
+                    model, training, trial.poles, trial.seed, trial.base, short=several
+                )
+                fitted.append(found)
             except ValueError as error:  # for instance a channel that is constant there
                 problems.append(str(error))
 
@@ -94,27 +107,33 @@ def run(trial: Trial) -> Tried:
     def unscaled(found: Fit) -> Model:
         return replace(found.model, scaling=None)
 
-    look(trial.models)
+    if trial.fit is not None:
+        fitted.append(trial.fit)
+    else:
+        look(trial.models)
     if not fitted:
         return Tried(trial.models[0], np.zeros(0), time.perf_counter() - begin, problems[0])
-    if trial.refine is not None:
+    if trial.refine is not None and several:
         for times in range(REFINEMENTS):
             look(trial.refine(unscaled(best()), times))
     model = unscaled(best())
-    parts = []
+    parts, first = [], best()
     try:
         for index, fold in enumerate(trial.folds):
-            if index == 0 and not several:  # fitted in full already
-                found = best()
+            if index == 0:
+                if several:  # so far only to rank it
+                    first = quick_fit(model, training, trial.poles, trial.seed, trial.base)
+                found = first
             else:
-                found = quick_fit(model, without(trial.record, fold), trial.poles, trial.seed)
+                rest = without(trial.record, fold)
+                found = quick_fit(model, rest, trial.poles, trial.seed, trial.base)
             parts.append(held_out_density(found, trial.record, fold, trial.score))
     except ValueError as error:
         problems.append(str(error))
         parts = [np.zeros(0)]
     seconds = time.perf_counter() - begin
     failure = problems[-1] if not len(parts[0]) else ""
-    return Tried(model, np.concatenate(parts), seconds, failure)
+    return Tried(model, np.concatenate(parts), seconds, failure, first)
 
 
 def without(record: Record, fold: np.ndarray) -> Record:
@@ -126,31 +145,58 @@ def without(record: Record, fold: np.ndarray) -> Record:
 
 
 def quick_fit(
-    model: Model, record: Record, poles: np.ndarray | None, seed: int, *, short: bool = False
+    model: Model,
+    record: Record,
+    poles: np.ndarray | None,
+    seed: int,
+    base: Fit | None = None,
+    *,
+    short: bool = False,
 ) -> Fit:
-    """Posterior mode of a model; a linear one starts from the poles of the one it extends, too.
+    """Posterior mode of a model, from few starts and from the fit of the model it extends.
 
     Args:
         model: the model. record: training record. poles: (P,) of a linear model [1/time unit].
-        seed: of fresh starts. short: fewer iterations, to rank variants of a linear model.
+        seed: of fresh starts. base: fit of the model that it extends, where a cascade may start.
+        short: fewer iterations, to rank variants of a linear model.
 
     Raises:
         ValueError: where the record does not fit the model, or a channel is constant.
     """
-    if isinstance(model, Cascade):
-        return fit_model(
-            replace(model, scaling=None), record, method="map", restarts=CASCADE_STARTS,
-            steps=CASCADE_STEPS, seed=seed, workers=1, progress=False,
-        )  # fmt: skip
-    steps = LINEAR_STEPS // 3 if short else LINEAR_STEPS
-    return _linear(replace(model, scaling=None), record, poles, seed, steps)
+    records = model.check(record)
+    scaled = replace(model, scaling=None).scaled_to(records)
+    if isinstance(scaled, Cascade):
+        optima = _cascade(scaled, records, seed, base)
+    else:
+        steps = LINEAR_STEPS // 3 if short else LINEAR_STEPS
+        optima = _linear(scaled, records, poles, seed, steps)
+    best = optima[0]
+    return Fit(
+        model=scaled,
+        method="map",
+        draws=MappingProxyType({k: v.unsqueeze(0) for k, v in best.values.items()}),
+        mode=MappingProxyType(dict(best.values)),
+        history=best.history,
+        start_energies=np.array([one.energy for one in optima]),
+        diagnostics=MappingProxyType({"iterations": float(len(best.history))}),
+        seed=seed,
+        records=records,
+    )
+
+
+def at_mode(fit: Fit) -> Fit:
+    """The fit with its posterior mode for draws, as refits have it."""
+    draws = MappingProxyType({k: v.unsqueeze(0) for k, v in fit.mode.items()})
+    return fit if fit.method == "map" else replace(fit, method="map", draws=draws)
 
 
 def _linear(
-    model: LinearDynamicGP, record: Record, poles: np.ndarray | None, seed: int, steps: int
-) -> Fit:
-    records = model.check(record)
-    model = model.scaled_to(record)
+    model: LinearDynamicGP,
+    records: Sequence[Record],
+    poles: np.ndarray | None,
+    seed: int,
+    steps: int,
+) -> list[Optimum]:
     assert model.scaling is not None
     starts = starting_values(model, records, count=LINEAR_STARTS, seed=seed)
     if poles is not None:
@@ -162,19 +208,43 @@ def _linear(
                 fresh = random_poles(more, model.scaling, generator)
                 kept = np.concatenate([kept, fresh])
             starts.append(values_given_poles(model, records, model.scaling, kept)[1])
-    optima = maximise(model, records[0], starts, steps=steps, seed=seed, workers=1)
-    best = optima[0]
-    return Fit(
-        model=model,
-        method="map",
-        draws=MappingProxyType({k: v.unsqueeze(0) for k, v in best.values.items()}),
-        mode=MappingProxyType(dict(best.values)),
-        history=best.history,
-        start_energies=np.array([one.energy for one in optima]),
-        diagnostics=MappingProxyType({"iterations": float(len(best.history))}),
-        seed=seed,
-        records=records,
-    )
+    return maximise(model, records[0], starts, steps=steps, seed=seed, workers=1)
+
+
+def _cascade(
+    model: Cascade, records: Sequence[Record], seed: int, base: Fit | None
+) -> list[Optimum]:
+    """Fresh starts, and one from the base where it is a cascade of the same layers.
+
+    Without a function a cascade starts at its optimum but for the noise: one start is enough.
+    """
+    functions = any(isinstance(layer, Static) for layer in model.layers)
+    count = CASCADE_STARTS if functions else 1
+    target = model.collapsed
+    linear = min(CASCADE_STEPS, LINEAR_STEPS)
+    starts = starting_points(target, records, count, linear, seed, 1, False, NOTHING_KEPT)
+    before = None if base is None else base.model
+    if isinstance(before, Cascade) and len(before.layers) == len(model.layers):
+        assert base is not None
+        starts = [_extended(base.mode, starts[0]), *starts[: max(1, count // 2)]]
+    return maximise(
+        target, records[0], starts, optimizer="adam", steps=CASCADE_STEPS, seed=seed, workers=1,
+        kept=0.5,
+    )  # fmt: skip
+
+
+def _extended(values: Mapping[str, Tensor], start: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Values of a smaller model in those of one with more sites, rows or columns."""
+    out = {}
+    for name, value in start.items():
+        new = value.clone()
+        if name in values and values[name].dim() == new.dim():
+            common = tuple(
+                slice(min(a, b)) for a, b in zip(new.shape, values[name].shape, strict=True)
+            )
+            new[common] = values[name][common]
+        out[name] = new
+    return out
 
 
 def poles_of(fit: Fit) -> np.ndarray | None:
@@ -190,22 +260,26 @@ def held_out_density(fit: Fit, record: Record, fold: np.ndarray, score: Score) -
 
     "one step": each given all outputs before it, of the mixture of the fit's draws; outputs of one
     time follow one another. What is wrong with the noise shows there. "forecast": each by itself,
-    given the inputs and the outputs before the fold, as a normal whose standard deviation is that
-    of the forecast times the factor that suits the fold best. What is wrong between inputs and
-    output shows there, while outputs of one step before make up for much of it; and what is asked
-    is which structure is right, not which posterior mode is least sure of itself.
+    given the inputs and the outputs before its stretch of the fold, as a normal whose standard
+    deviation is that of the forecast times the factor that suits the fold best. What is wrong
+    between inputs and output shows there, while outputs of one step before make up for much of it;
+    and what is asked is which structure is right, not which posterior mode is least sure of itself.
     """
     prepared = fit.model.check(record)[0]
+    there = ~prepared.missing
     if score == "one step":
-        density = one_step_density(fit, prepared)[fold]
+        density = one_step_density(fit, prepared)
     else:
-        first, last = np.flatnonzero(fold)[[0, -1]]
-        future = prepared[first : last + 1]
-        found = fit.forecast(prepared[:first], future, seed=fit.seed)
-        z = (future.outputs - found.mean) / found.sd
-        spread = np.sqrt(np.nanmean(z**2, axis=0))
-        density = -0.5 * ((z / spread) ** 2 + np.log(2.0 * np.pi)) - np.log(spread * found.sd)
-    return density[~prepared.missing[fold]]
+        density = np.full(there.shape, np.nan)
+        z, sd = density.copy(), density.copy()
+        for part in stretches(fold):
+            found = fit.forecast(prepared[: part.start], prepared[part], seed=fit.seed)
+            z[part] = (prepared.outputs[part] - found.mean) / found.sd
+            sd[part] = found.sd
+        spread = np.sqrt(np.nanmean(z[fold] ** 2, axis=0))
+        density = -0.5 * ((z / spread) ** 2 + np.log(2.0 * np.pi)) - np.log(spread * sd)
+    scored: np.ndarray = density[fold][there[fold]]
+    return scored
 
 
 def one_step_density(fit: Fit, record: Record) -> np.ndarray:
@@ -222,8 +296,16 @@ def one_step_density(fit: Fit, record: Record) -> np.ndarray:
     return logsumexp(each, axis=0) - np.log(len(each))
 
 
-def blocks(count: int, folds: int) -> tuple[np.ndarray, ...]:
-    """Contiguous folds (n,) of a record's samples."""
-    edges = np.linspace(0, count, folds + 1).astype(int)
-    index = np.arange(count)
-    return tuple((index >= a) & (index < b) for a, b in pairwise(edges))
+def stretches(mask: np.ndarray) -> list[slice]:
+    """Stretches of samples for which a mask (n,) holds."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
+    return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def interleaved(count: int) -> tuple[np.ndarray, ...]:
+    """Two folds (n,): every other block of a record, and those between but for the first.
+
+    What happens at one instant has data on either side of it in both.
+    """
+    number = np.arange(count) * BLOCKS // max(count, 1)
+    return (number % 2 == 1), ((number % 2 == 0) & (number > 0))

@@ -1,0 +1,204 @@
+"""Refits of the effects that the residual speaks for: which of them held-out data confirm."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from pyro_dynogp.criticism.comparison import block_standard_error
+from pyro_dynogp.discrepancy.extend import Model
+from pyro_dynogp.discrepancy.report import Attempt
+from pyro_dynogp.discrepancy.search import Found
+from pyro_dynogp.discrepancy.trials import Score, Trial, Tried, interleaved, run
+from pyro_dynogp.inference.result import Fit
+from pyro_dynogp.parallel import parallel_map
+from pyro_dynogp.record import Record
+
+# A gain counts if it is more than so many block standard errors, and than so many nats.
+ERRORS, NATS = 2.0, 4.0
+
+# Where densities are scored: after the training data, or on blocks spread over the whole record.
+Where = Literal["after", "spread"]
+Kind = tuple[Where, Score]
+
+
+@dataclass(frozen=True, eq=False)
+class Confirmed:
+    """What refits say about the candidates of a round.
+
+    Attributes:
+        attempts: of all candidates. winner: the one to add, None if none helps.
+        before: the model without it. model: extended by it. attempt: that of the winner.
+        fit: of the extended model to what is not held out; None where there is none yet.
+        ties: names of effects that explain as much.
+    """
+
+    attempts: tuple[Attempt, ...]
+    winner: Found | None
+    before: Model
+    model: Model | None
+    attempt: Attempt | None
+    fit: Fit | None
+    ties: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Judged:
+    """A candidate, its refit, and its gain over the model without it."""
+
+    found: Found
+    kind: Kind
+    tried: Tried
+    attempt: Attempt
+
+    @property
+    def helps(self) -> bool:
+        a = self.attempt
+        return bool(a.gain > NATS and a.gain > ERRORS * a.gain_error)
+
+
+def confirm(
+    candidates: Sequence[tuple[Found, tuple[Model, ...]]],
+    current: Fit,
+    record: Record,
+    held_out: np.ndarray,
+    poles: np.ndarray | None,
+    *,
+    number: int,
+    seed: int,
+    level: float,
+    workers: int | None = None,
+    progress: bool = False,
+) -> Confirmed:
+    """Add each candidate alone, refit, and compare the densities of what was held out.
+
+    Args:
+        candidates: from `candidates_of`. current: fit of the model that is extended, to what is not
+            held out. record: blocks A and B. held_out: (n,) True in B. poles: of the model.
+        number: of the round. seed: of refits. level: of the tests.
+    """
+    model = replace(current.model, scaling=None)
+    folds: dict[Where, tuple[np.ndarray, ...]] = {
+        "after": (held_out,),
+        "spread": interleaved(len(record)),
+    }
+
+    def trial(models: tuple[Model, ...], kind: Kind, found: Found | None) -> Trial:
+        where, score = kind
+        known = current if found is None and where == "after" else None
+        refine = None if found is None else found.effect.refine
+        return Trial(models, record, folds[where], poles, seed, score, refine, known, current)
+
+    def fitted(tasks: dict[Any, Trial], label: str) -> dict[Any, Tried]:
+        done = parallel_map(
+            run, list(tasks.values()), workers=workers, progress=progress,
+            description=f"{label}, round {number}",
+        )  # fmt: skip
+        return dict(zip(tasks, done, strict=True))
+
+    kinds: list[Kind] = [
+        ("spread", "forecast") if f.effect.localised else ("after", f.effect.score)
+        for f, _ in candidates
+    ]
+    # Two effects may be the same block of the model: it is fitted once.
+    tasks = {("", kind): trial((model,), kind, None) for kind in kinds}
+    for (found, variants), kind in zip(candidates, kinds, strict=True):
+        tasks[repr(variants), kind] = trial(variants, kind, found)
+    results = fitted(tasks, "refits")
+    judged = [
+        _judge(found, kind, results[repr(variants), kind], results["", kind], number)
+        for (found, variants), kind in zip(candidates, kinds, strict=True)
+    ]
+    attempts = [one.attempt for one in judged]
+    better = _first_in_line([one for one in judged if one.helps], level)
+    if not better:
+        return Confirmed(tuple(attempts), None, model, None, None, None, ())
+    if len({one.kind for one in better}) > 1:  # their gains do not compare: score all on one
+        common: Kind = ("spread", "forecast")
+        others = [one for one in better if one.kind != common]
+        more = {repr(b.tried.model): trial((b.tried.model,), common, b.found) for b in others}
+        again = fitted(more, "refits once more")
+        base = results["", common]
+        playing = [
+            one if one.kind == common
+            else _judge(one.found, common, again[repr(one.tried.model)], base, number)
+            for one in better
+        ]  # fmt: skip
+        best = _best([one for one in playing if not one.tried.failure])
+    else:
+        playing, best = better, _best(better)
+    equal = [k for k, one in enumerate(playing) if one is best or _ties(one, best)]
+    # Of effects that are one block of the model the most probable one gives it its name.
+    first = {repr(playing[k].tried.model): k for k in reversed(equal)}
+    chosen = min(
+        first.values(), key=lambda k: (better[k].found.effect.freedom, -playing[k].attempt.gain)
+    )
+    winner = better[chosen]
+    name = winner.found.effect.name
+    names = dict.fromkeys(better[k].found.effect.name for k in equal)
+    decided = []
+    for one in judged:
+        if one is winner:
+            new = replace(one.attempt, decision="accepted")
+        elif any(one is better[k] for k in equal):
+            new = replace(one.attempt, decision="tie", reason=f"explains as much as {name}")
+        elif one.helps:
+            new = replace(one.attempt, decision="rejected", reason=f"{name} comes first")
+        else:
+            new = one.attempt
+        decided.append(new)
+    return Confirmed(
+        attempts=tuple(decided),
+        winner=winner.found,
+        before=model,
+        model=winner.tried.model,
+        attempt=next(a for a in decided if a.decision == "accepted"),
+        fit=winner.tried.fit if winner.kind[0] == "after" else None,
+        ties=tuple(one for one in names if one != name),
+    )
+
+
+def _judge(found: Found, kind: Kind, tried: Tried, base: Tried, number: int) -> _Judged:
+    """A candidate against the model without it."""
+    evidence, q = found.evidence, found.q_value
+    if tried.failure or base.failure:
+        reason = f"could not be fitted: {tried.failure or base.failure}"
+        return _Judged(found, kind, tried, Attempt(number, evidence, q, "rejected", reason))
+    d = tried.densities - base.densities
+    gain, error = float(d.sum()), block_standard_error(d)[0]
+    reason = f"held-out elpd {gain:+.1f} +- {error:.1f} nats"
+    attempt = Attempt(number, evidence, q, "rejected", reason, gain, error, tried.seconds)
+    return _Judged(found, kind, tried, attempt)
+
+
+def _first_in_line(better: Sequence[_Judged], level: float) -> list[_Judged]:
+    """Of effects that help those that the residual itself speaks for, structure before noise.
+
+    What was only tried beside a relative does not count where some cause of another family is
+    certain: with eight candidates one improves on held-out data by luck. And gains of forecasts and
+    of one step ahead do not compare: first comes what lies between inputs and output, whose lack
+    looks like noise, and noise when nothing of that kind is left.
+    """
+    certain = {one.found.effect.family for one in better if one.found.q_value <= level}
+    if certain:
+        better = [
+            one for one in better
+            if one.found.evidence.p_value <= level or one.found.effect.family in certain
+        ]  # fmt: skip
+    structural = [one for one in better if one.kind[1] == "forecast"]
+    return structural or list(better)
+
+
+def _best(judged: Sequence[_Judged]) -> _Judged:
+    return max(judged, key=lambda one: one.attempt.gain)
+
+
+def _ties(one: _Judged, best: _Judged) -> bool:
+    """Whether two candidates explain held-out data equally well, within two standard errors."""
+    if one.tried.failure:
+        return False
+    d = best.tried.densities - one.tried.densities
+    return bool(d.sum() <= max(ERRORS * block_standard_error(d)[0], NATS))
