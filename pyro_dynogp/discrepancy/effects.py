@@ -193,40 +193,65 @@ class DeadTime(Effect):
         return [replace(e, where={**e.where, "time_unit": residuals.time_unit}) for e in found]
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
-        """Each input delayed: by the estimate, and by delays from a step to a tenth of the record.
+        """Each input, and all of them, delayed: by the estimate, and up to a tenth of the record.
 
         Poles make up for much of a delay, so that estimates of it are rough.
         """
         channel, more = str(evidence.where["channel"]), _number(evidence, "delay")
         step = record.sampling_time
-        count = max(2, int(2.0 * np.log2(len(record) / 10.0)))
-        grid = step * np.geomspace(1.0, len(record) / 10.0, count)
+        count = max(2, int(1.5 * np.log2(len(record) / 10.0)))
+        grid = {float(d) for d in step * np.geomspace(1.0, len(record) / 10.0, count)}
+        around = {share * more for share in AROUND}
         prepared = model.check(record)[0]
-        variants = []
-        for name in prepared.input_names[: prepared.n_inputs - model.direct]:
-            known, plain, source = 0.0, model, name
-            for one in model.channels:
-                if isinstance(one, Delayed) and name in one.names:  # correct the delay it has
-                    known, plain, source = one.delay, without_channel(model, one), one.channel
-            delays = {known + float(d) for d in grid}
-            if name == channel:
-                delays |= {known + share * more for share in AROUND}
-            variants += [
-                with_channel(plain, Delayed(source, d)) for d in sorted(delays) if d > 0.2 * step
-            ]
-        return variants
+        names = prepared.input_names[: prepared.n_inputs - model.direct]
+        places = [(name,) for name in names] + ([names] if len(names) > 1 else [])
+        return [
+            later
+            for place in places
+            for delay in sorted(grid | around if channel in place else grid)
+            if (later := _later(model, place, delay, 0.2 * step)) is not None
+        ]
 
     def sentence(self, evidence: Evidence, model: Model) -> str:
-        """The channel and its delay as refits have them."""
-        last = model.channels[-1]
-        assert isinstance(last, Delayed)
-        return (
-            f"Channel {last.channel!r} acts with a dead time of {last.delay:.3g}{_unit(evidence)}."
-        )
+        """The channels and their delay as refits have them."""
+        found = self._found(model)
+        names = " and ".join(repr(one.channel) for one in found)
+        start = f"Channel {names} acts" if len(found) == 1 else f"Channels {names} act"
+        return f"{start} with a dead time of {found[0].delay:.3g}{_unit(evidence)}."
 
     def refine(self, model: Model, times: int) -> Sequence[Model]:
         """The delay a little shorter and longer."""
-        return _finer(model, "delay", times)
+        found = self._found(model)
+        return [
+            replace(
+                model,
+                channels=tuple(
+                    replace(one, delay=share * one.delay) if one in found else one
+                    for one in model.channels
+                ),
+            )
+            for share in FINER[times]
+        ]
+
+    def _found(self, model: Model) -> list[Delayed]:
+        """Delays that were set last, together."""
+        last = model.channels[-1]
+        assert isinstance(last, Delayed)
+        return [c for c in model.channels if isinstance(c, Delayed) and c.delay == last.delay]
+
+
+def _later(model: Model, names: Sequence[str], more: float, least: float) -> Model | None:
+    """The model with inputs delayed by more than they are; None for less than the least delay."""
+    for name in names:
+        source, known = name, 0.0
+        for one in model.channels:
+            if isinstance(one, Delayed) and name in one.names:  # correct the delay it has
+                source, known = one.channel, one.delay
+                model = without_channel(model, one)
+        if known + more < least:
+            return None
+        model = with_channel(model, Delayed(source, known + more))
+    return model
 
 
 class UnmodelledDynamics(Effect):
