@@ -46,7 +46,12 @@ def _named(row: Row) -> list[str]:
 
 
 def is_right(row: Row) -> bool:
-    """Whether the planted effect was named first; outside the catalogue, that none is known."""
+    """Whether the planted effect was named first.
+
+    Of what is outside the catalogue, that no cause is known, or that several explain it.
+    """
+    if row["effect"] == OUTSIDE and row.get("ties"):
+        return True
     return top_name(row) == _right_name(row["effect"])
 
 
