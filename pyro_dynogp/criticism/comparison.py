@@ -30,8 +30,9 @@ class Comparison:
     Attributes:
         table: one row for each model, best first: ArviZ's columns (rank, elpd_loo, p_loo,
             elpd_diff, weight, se, dse, warning) and `dse_block`, the standard error of the
-            difference that knows how neighbouring samples go together, `n_effective`, how many
-            independent differences the record holds, `clear`, whether the model is clearly worse
+            difference that knows how neighbouring samples go together, and the Monte Carlo errors
+            of both elpds; `n_effective`, how many independent differences the record holds;
+            `clear`, whether the model is clearly worse
             than the best one.
         elpds: ELPDData by name. target: what was left out.
     """
@@ -97,6 +98,9 @@ def compare(
     for name in table.index:
         difference = best - np.asarray(elpds[str(name)].loo_i)
         error, count = block_standard_error(difference)
+        if name != table.index[0]:  # draws of two models are independent
+            both = (elpds[str(n)].get("monte_carlo_error", 0.0) for n in (name, table.index[0]))
+            error = float(np.sqrt(error**2 + sum(e**2 for e in both)))
         total = float(difference.sum())
         errors.append(error)
         effective.append(count)

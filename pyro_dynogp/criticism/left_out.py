@@ -32,22 +32,25 @@ class Base:
         log_weights: (S,) normalised and smoothed.
         k: Pareto shape of the proposal; 0 for draws of the posterior itself.
         corrected: whether the ratios are used.
+        ancestor: (S,) as of the draws.
     """
 
     log_ratio: np.ndarray
     log_weights: np.ndarray
     k: float
     corrected: bool
+    ancestor: np.ndarray | None = None
 
     @classmethod
     def of(cls, subject: Subject) -> Base:
         """Ratios, or none where the posterior's own k says that they are not to be trusted."""
-        ratio = subject.draws.log_ratio
+        draws = subject.draws
+        ratio, ancestor = draws.log_ratio, draws.ancestor
         log_weights, k = arviz_bridge.psis(ratio)
         if k <= arviz_bridge.good_k(len(ratio)):
-            return cls(ratio, log_weights, float(k), True)
+            return cls(ratio, log_weights, float(k), True, ancestor)
         plain = np.full(len(ratio), -np.log(len(ratio)))
-        return cls(np.zeros_like(ratio), plain, float(k), False)
+        return cls(np.zeros_like(ratio), plain, float(k), False, ancestor)
 
 
 @dataclass
@@ -76,13 +79,34 @@ def mixture(log_weights: np.ndarray, log_density: np.ndarray) -> np.ndarray:
     return logsumexp(log_weights + log_density.T, axis=-1)
 
 
-def monte_carlo_error(log_weights: np.ndarray, log_density: np.ndarray, elpd: np.ndarray) -> float:
+def monte_carlo_error(
+    log_weights: np.ndarray,
+    log_density: np.ndarray,
+    elpd: np.ndarray,
+    ancestor: np.ndarray | None = None,
+) -> float:
     """Standard error of the sum of `mixture` from its draws, by the delta method.
 
     Each draw's influence is summed over samples first: all of them share the draws.
+
+    Args:
+        log_weights: (N, S). log_density: (S, N). elpd: (N,).
+        ancestor: (S,) as of `PosteriorDraws`.
     """
     share = np.exp(log_weights + log_density.T - elpd[:, None]) - np.exp(log_weights)
-    return float(np.sqrt(np.square(share.sum(0)).sum()))
+    return spread_of(share.sum(0), ancestor)
+
+
+def spread_of(influence: np.ndarray, ancestor: np.ndarray | None) -> float:
+    """Standard error of a sum over draws from their influences (S,).
+
+    Draws of one ancestor are not independent: their influences are added up first.
+
+    Source: Lee & Whiteley, Biometrika 105(3):609 (2018), without its factor for few particles.
+    """
+    if ancestor is not None:
+        influence = np.bincount(ancestor, influence)
+    return float(np.sqrt(np.square(influence).sum()))
 
 
 def missing_sample(subject: Subject, most: int, workers: int | None, progress: bool) -> Found:
@@ -93,7 +117,7 @@ def missing_sample(subject: Subject, most: int, workers: int | None, progress: b
     elpd = mixture(log_weights, density)
     whole = base.log_weights
     lppd = float(mixture(np.broadcast_to(whole, log_weights.shape), density).sum())
-    error = monte_carlo_error(log_weights, density, elpd)
+    error = monte_carlo_error(log_weights, density, elpd, base.ancestor)
     N = density.shape[1]
     found = Found(base, np.arange(N), elpd, k, lppd, error)
     _note(found, subject)
@@ -141,7 +165,7 @@ def forecast(
         )  # fmt: skip
     step, target = _both(subject, horizon)
     base = Base.of(subject)
-    log_ratio = base.log_ratio
+    log_ratio, ancestor = base.log_ratio, base.ancestor
     good = arviz_bridge.good_k(len(log_ratio))
     found = Found(base, scored, np.zeros(len(scored)), np.zeros(len(scored)), 0.0, 0.0)
     _note(found, subject)
@@ -151,7 +175,8 @@ def forecast(
     if len(whole) == 1:  # one draw weighs what it weighs, whatever is left out
         found.elpd = target[0, scored]
         return found
-    shares: list[np.ndarray] = []
+    shares: list[np.ndarray] = []  # influences on forecasts since the last refit
+    errors: list[float] = []
     end = len(sample)  # data before this one are in the current fit
     bar = tqdm(total=len(scored), desc="forecasts", disable=not progress)
     for place in range(len(scored) - 1, -1, -1):
@@ -162,8 +187,12 @@ def forecast(
         if k > good and found.refits < most:
             current = subject.without(np.arange(len(sample)) >= known)
             found.refits += 1
+            if shares:  # other draws from here on
+                errors.append(spread_of(np.sum(shares, axis=0), ancestor))
+                shares = []
             step, target = _both(current, horizon)
-            log_ratio, end = Base.of(current).log_ratio, known
+            again = Base.of(current)
+            log_ratio, ancestor, end = again.log_ratio, again.ancestor, known
             log_weights, k = _given(log_ratio, step, known, end)
         elif k > good:
             found.left += 1
@@ -172,7 +201,8 @@ def forecast(
         shares.append(np.exp(log_weights + target[:, i] - found.elpd[place]) - np.exp(log_weights))
         bar.update()
     bar.close()
-    found.error = float(np.sqrt(np.square(np.sum(shares, axis=0)).sum()))
+    errors.append(spread_of(np.sum(shares, axis=0), ancestor))
+    found.error = float(np.sqrt(np.square(errors).sum()))
     return found
 
 
@@ -215,11 +245,10 @@ def new_record(subject: Subject, folds: int, workers: int | None, progress: bool
     k = np.concatenate([np.full(len(one[0]), one[1]) for one in results])
     error = float(np.sqrt(sum(one[2] ** 2 for one in results)))
     base = Base.of(subject)
-    weights = base.log_weights
-    lppd = sum(float(_chain(weights, subject.fresh(*block[1]))[0].sum()) for block in blocks)
+    lppd = sum(float(_chain(base, subject.fresh(*block[1]))[0].sum()) for block in blocks)
     found = Found(base, order, elpd, k, lppd, error, refits=len(blocks))
     _note(found, subject)
-    found.left = int((k > arviz_bridge.good_k(len(weights))).sum())
+    found.left = int((k > arviz_bridge.good_k(len(base.log_weights))).sum())
     return found
 
 
@@ -253,19 +282,20 @@ def _held_out(subject: Subject, block: Block) -> tuple[np.ndarray, float, float]
     left_out[own] = True
     other = subject.without(left_out)
     base = Base.of(other)
-    elpd, error = _chain(base.log_weights, other.fresh(*where))
+    elpd, error = _chain(base, other.fresh(*where))
     return elpd, base.k, error
 
 
-def _chain(log_weights: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, float]:
+def _chain(base: Base, step: np.ndarray) -> tuple[np.ndarray, float]:
     """Densities (N',) of samples one after the other, each given those before it in the block.
 
     They add up to the log of the mean density of the whole block, and to its Monte Carlo error.
     """
+    log_weights = base.log_weights
     cumulated = log_weights[:, None] + np.cumsum(step, axis=1)
     joint = logsumexp(cumulated, axis=0)
     weight = np.exp(log_weights)
-    error = float(np.sqrt(np.square(np.exp(cumulated[:, -1] - joint[-1]) - weight).sum()))
+    error = spread_of(np.exp(cumulated[:, -1] - joint[-1]) - weight, base.ancestor)
     return np.diff(joint, prepend=logsumexp(log_weights)), error
 
 

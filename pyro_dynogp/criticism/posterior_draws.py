@@ -51,6 +51,8 @@ class PosteriorDraws:
             itself (MCMC).
         group: (S,) optimum that each draw belongs to.
         kind: where they come from, in words.
+        ancestor: (S,) number of the independent draw that each descends from, of draws that were
+            resampled on their way; None where all are independent.
     """
 
     values: Values
@@ -58,6 +60,7 @@ class PosteriorDraws:
     log_q: np.ndarray | None
     group: np.ndarray
     kind: str
+    ancestor: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.group)
@@ -196,6 +199,7 @@ def _annealed(
         None,
         np.zeros(particles, dtype=int),
         f"annealed from {own.kind}, whose own Pareto k is {shape}",
+        annealed.ancestor,
     )
 
 

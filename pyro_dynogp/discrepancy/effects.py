@@ -428,10 +428,25 @@ class CalendarEffect(Effect):
         return _listed(calendar(residuals, zones=self.zones, seed=seed))
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
-        """The part of the calendar as direct inputs."""
+        """The part of the calendar as direct inputs; or all that the model has, on that clock.
+
+        In place of the same part, if the model has it: with twice the harmonics if on that clock.
+        """
         what, zone = str(evidence.where["what"]), str(evidence.where["zone"])
         part = CALENDAR_PARTS.get(what, what)
-        return [with_channel(model, Calendar(part, zone, 3 if part == "time of year" else 6))]
+        there = [one for one in model.channels if isinstance(one, Calendar)]
+        harmonics, plain = 3 if part == "time of year" else 6, model
+        for one in there:
+            if one.what == part:
+                plain = without_channel(plain, one)
+                harmonics = max(harmonics, one.harmonics * (2 if one.zone == zone else 1))
+        variants = [with_channel(plain, Calendar(part, zone, harmonics))]
+        if any(one.zone != zone for one in there):
+            channels = tuple(
+                replace(c, zone=zone) if isinstance(c, Calendar) else c for c in model.channels
+            )
+            variants.append(replace(model, channels=channels))
+        return variants
 
 
 class ClockShift(Effect):

@@ -27,8 +27,14 @@ def with_channel(model: Model, channel: Channel) -> Model:
 
 
 def without_channel(model: Model, channel: Channel) -> Model:
-    """The model without a channel that replaces an input, and that no other one builds on."""
-    return replace(model, channels=tuple(one for one in model.channels if one != channel))
+    """The model without a channel that no other one builds on."""
+    less = 0 if channel.replaces else len(channel.names)
+    return replace(
+        model,
+        inputs=model.inputs - less,
+        direct=model.direct - count_direct([channel]),
+        channels=tuple(one for one in model.channels if one != channel),
+    )
 
 
 def with_pairs(model: Model, count: int) -> Model:

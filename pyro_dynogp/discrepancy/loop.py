@@ -43,8 +43,8 @@ from pyro_dynogp.record import Record
 if TYPE_CHECKING:
     from pyro_dynogp.inference.result import Fit
 
-# Starts of the last fit of a cascade.
-FINAL_STARTS = 4
+# Fresh starts of the last fits, of linear models and of cascades.
+LINEAR_STARTS, CASCADE_STARTS = 2, 4
 SCORES = ("rmse", "mae", "nrmse", "crps", "coverage_50", "coverage_95")
 
 
@@ -262,10 +262,9 @@ def _untried(
 
 
 def _final(fits: Sequence[Fit], record: Record, workers: int | None, progress: bool) -> list[Fit]:
-    """Models of block A fitted to A and B, by all starts that `pyro_dynogp.fit` makes.
+    """Models of block A fitted to A and B, from what they have learnt and from fresh starts.
 
-    Refits of the search are posterior modes from few starts; here the best optimum is wanted, and
-    the posterior of static functions.
+    Refits of the search are posterior modes; here the posterior of static functions is wanted.
     """
 
     def one(given: Fit) -> Fit:
@@ -274,9 +273,10 @@ def _final(fits: Sequence[Fit], record: Record, workers: int | None, progress: b
             isinstance(layer, Static) for layer in model.layers
         )
         method: Method = "svi" if functions or given.method != "map" else "map"
+        restarts = CASCADE_STARTS if isinstance(model, Cascade) else LINEAR_STARTS
         return fit_model(
-            model, record, method=method, restarts=FINAL_STARTS if functions else None,
-            seed=given.seed, workers=1, progress=False,
+            model, record, method=method, start=given, restarts=restarts, seed=given.seed,
+            workers=1, progress=False,
         )  # fmt: skip
 
     return parallel_map(one, fits, workers=workers, progress=progress, description="last fits")
@@ -304,12 +304,7 @@ def _report(
     densities = [one_step_density(one, whole)[sealed] for one in (base, extended)]
     there = np.isfinite(densities[0])
     gain = densities[1][there] - densities[0][there]
-    tests: dict[str, tuple[float, float]] = {}
-    if accepted:
-        without, having = (state.residuals(one, whole, sealed) for one in (base, extended))
-        for found, _ in accepted:
-            p_before = _smallest(found.effect, without, state.seed)
-            tests[found.effect.name] = p_before, _smallest(found.effect, having, state.seed)
+    tests = _tested([f for f, _ in accepted], (base, extended), whole, sealed, state)
     return Report(
         effects=(
             *(_effect(f, c, extended) for f, c in accepted),
@@ -342,10 +337,25 @@ def _outcome(added: bool, left: bool) -> str:
     return "structure left, cause unknown" if left else "nothing missing"
 
 
-def _smallest(effect: Effect, residuals: Sequence[Residuals], seed: int) -> float:
-    """Smallest p-value of an effect's tests; 1 where there is nothing left to test."""
-    found = [e.p_value for one in residuals for e in effect.detect(one, seed=seed)]
-    return min(found, default=1.0)
+def _tested(
+    found: Sequence[Found], fits: Sequence[Fit], whole: Record, sealed: np.ndarray, state: _State
+) -> dict[str, tuple[float, float]]:
+    """Smallest p-value of each effect's tests on C, of the model before and after."""
+    effects = list({f.effect.name: f.effect for f in found}.values())
+    if not effects:
+        return {}
+    residuals = [state.residuals(one, whole, sealed) for one in fits]
+
+    def smallest(task: tuple[Effect, list[Residuals]]) -> float:
+        effect, parts = task
+        p = [e.p_value for one in parts for e in effect.detect(one, seed=state.seed)]
+        return min(p, default=1.0)  # nothing left to test
+
+    tasks = [(effect, parts) for effect in effects for parts in residuals]
+    p = parallel_map(
+        smallest, tasks, workers=state.workers, progress=state.progress, description="last tests"
+    )
+    return {effect.name: (p[2 * k], p[2 * k + 1]) for k, effect in enumerate(effects)}
 
 
 def _effect(found: Found, confirmed: Confirmed, extended: Fit) -> FoundEffect:

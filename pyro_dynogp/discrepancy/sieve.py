@@ -248,9 +248,11 @@ def columns_score(
         w = w if there.all() else w[there]
         own = np.maximum(np.sqrt(np.einsum("ij,ij->j", w, w)), 1e-12)
         P = (Q.T @ w) / own
-        G = (w.T @ w) / (own[:, None] * own) - P.T @ P
-        # The ridge makes columns that the nuisance spans explain nothing.
-        inverses = [np.linalg.inv(G[np.ix_(v, v)] + 1e-8 * np.eye(len(v))) for v in variants]
+        inverses = []
+        for v in variants:  # each by itself: variants are many, and share few columns
+            G = (w[:, v].T @ w[:, v]) / (own[v][:, None] * own[v]) - P[:, v].T @ P[:, v]
+            # The ridge makes columns that the nuisance spans explain nothing.
+            inverses.append(np.linalg.inv(G + 1e-8 * np.eye(len(v))))
 
         def score(x: np.ndarray):
             e0 = whiten(x)[there]

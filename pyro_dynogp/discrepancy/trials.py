@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
 from scipy.special import logsumexp
-from torch import Tensor
 
 from pyro_dynogp.criticism.densities import pointwise_log_density
 from pyro_dynogp.discrepancy.extend import Model
@@ -18,7 +17,12 @@ from pyro_dynogp.inference.cascade_fit import starting_points
 from pyro_dynogp.inference.checkpoints import NOTHING_KEPT
 from pyro_dynogp.inference.maximum import Optimum, maximise
 from pyro_dynogp.inference.result import Fit
-from pyro_dynogp.inference.starts import random_poles, starting_values, values_given_poles
+from pyro_dynogp.inference.starts import (
+    grown,
+    random_poles,
+    starting_values,
+    values_given_poles,
+)
 from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.collapsed import collapsed_of
 from pyro_dynogp.models.layers import Static
@@ -157,8 +161,8 @@ def quick_fit(
 
     Args:
         model: the model. record: training record. poles: (P,) of a linear model [1/time unit].
-        seed: of fresh starts. base: fit of the model that it extends, where a cascade may start.
-        short: fewer iterations, to rank variants of a linear model.
+        seed: of fresh starts. base: fit of the model that it extends, where it may start.
+        short: fewer iterations, to rank variants.
 
     Raises:
         ValueError: where the record does not fit the model, or a channel is constant.
@@ -166,10 +170,10 @@ def quick_fit(
     records = model.check(record)
     scaled = replace(model, scaling=None).scaled_to(records)
     if isinstance(scaled, Cascade):
-        optima = _cascade(scaled, records, seed, base)
+        optima = _cascade(scaled, records, seed, base, short)
     else:
         steps = LINEAR_STEPS // 3 if short else LINEAR_STEPS
-        optima = _linear(scaled, records, poles, seed, steps)
+        optima = _linear(scaled, records, poles, seed, steps, base)
     best = optima[0]
     return Fit(
         model=scaled,
@@ -196,7 +200,9 @@ def _linear(
     poles: np.ndarray | None,
     seed: int,
     steps: int,
+    base: Fit | None,
 ) -> list[Optimum]:
+    """Fresh starts, from the poles of the base, and from all that it has learnt."""
     assert model.scaling is not None
     starts = starting_values(model, records, count=LINEAR_STARTS, seed=seed)
     if poles is not None:
@@ -208,43 +214,34 @@ def _linear(
                 fresh = random_poles(more, model.scaling, generator)
                 kept = np.concatenate([kept, fresh])
             starts.append(values_given_poles(model, records, model.scaling, kept)[1])
+    if base is not None and not isinstance(base.model, Cascade):
+        starts.append(grown(base.mode, starts[-1]))
     return maximise(model, records[0], starts, steps=steps, seed=seed, workers=1)
 
 
 def _cascade(
-    model: Cascade, records: Sequence[Record], seed: int, base: Fit | None
+    model: Cascade, records: Sequence[Record], seed: int, base: Fit | None, short: bool
 ) -> list[Optimum]:
-    """Fresh starts, and one from the base where it is a cascade of the same layers.
+    """Fresh starts; from the base instead, and one fresh one, where it has the same layers.
 
     Without a function a cascade starts at its optimum but for the noise: one start is enough.
     """
     functions = any(isinstance(layer, Static) for layer in model.layers)
-    count = CASCADE_STARTS if functions else 1
+    count, steps = CASCADE_STARTS if functions else 1, CASCADE_STEPS
     target = model.collapsed
-    linear = min(CASCADE_STEPS, LINEAR_STEPS)
-    starts = starting_points(target, records, count, linear, seed, 1, False, NOTHING_KEPT)
     before = None if base is None else base.model
-    if isinstance(before, Cascade) and len(before.layers) == len(model.layers):
+    warm = isinstance(before, Cascade) and len(before.layers) == len(model.layers)
+    linear = LINEAR_STEPS // 3 if warm else LINEAR_STEPS
+    starts = starting_points(
+        target, records, 1 if warm else count, linear, seed, 1, False, NOTHING_KEPT
+    )
+    if warm:
         assert base is not None
-        starts = [_extended(base.mode, starts[0]), *starts[: max(1, count // 2)]]
+        learnt = grown(base.mode, starts[0])
+        starts, steps = ([learnt], steps // 4) if short else ([learnt, starts[0]], steps // 2)
     return maximise(
-        target, records[0], starts, optimizer="adam", steps=CASCADE_STEPS, seed=seed, workers=1,
-        kept=0.5,
-    )  # fmt: skip
-
-
-def _extended(values: Mapping[str, Tensor], start: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Values of a smaller model in those of one with more sites, rows or columns."""
-    out = {}
-    for name, value in start.items():
-        new = value.clone()
-        if name in values and values[name].dim() == new.dim():
-            common = tuple(
-                slice(min(a, b)) for a, b in zip(new.shape, values[name].shape, strict=True)
-            )
-            new[common] = values[name][common]
-        out[name] = new
-    return out
+        target, records[0], starts, optimizer="adam", steps=steps, seed=seed, workers=1, kept=0.5
+    )
 
 
 def poles_of(fit: Fit) -> np.ndarray | None:

@@ -123,14 +123,14 @@ class Annealed:
         z: (S, d) unconstrained. log_evidence: log of the target's normalising constant over the
             start's.
         temperatures: b after each step. acceptance: of the moves at each.
-        ancestors: how many of the first particles the last ones descend from.
+        ancestor: (S,) first particle that each one descends from.
     """
 
     z: Tensor
     log_evidence: float
     temperatures: tuple[float, ...]
     acceptance: tuple[float, ...]
-    ancestors: int
+    ancestor: np.ndarray
 
 
 def anneal(
@@ -176,8 +176,9 @@ def anneal(
         accepted.append(float(np.mean(rates)))
         bar.update(round(100 * b) - bar.n)
     bar.close()
-    ancestors = len(torch.unique(ancestor))
-    return Annealed(now.z, log_evidence, tuple(temperatures), tuple(accepted), ancestors)
+    return Annealed(
+        now.z, log_evidence, tuple(temperatures), tuple(accepted), ancestor.numpy().copy()
+    )
 
 
 @dataclass(frozen=True, eq=False)

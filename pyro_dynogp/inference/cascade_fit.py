@@ -14,7 +14,7 @@ from pyro_dynogp.inference.cascade_starts import (
 )
 from pyro_dynogp.inference.checkpoints import Checkpoints
 from pyro_dynogp.inference.maximum import Optimizer, Optimum, maximise
-from pyro_dynogp.inference.starts import starting_values
+from pyro_dynogp.inference.starts import grown, starting_values
 from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.layers import Dynamic
 from pyro_dynogp.parallel import seeded
@@ -81,9 +81,12 @@ def best_optima(
     workers: int | None,
     progress: bool,
     checkpoints: Checkpoints,
+    learnt: Values | None = None,
 ) -> list[Optimum]:
-    """Optima of the collapsed model from all starts, best first."""
+    """Optima of the collapsed model from all starts, and from what is learnt, best first."""
     starts = starting_points(model, records, restarts, steps, seed, workers, progress, checkpoints)
+    if learnt is not None:
+        starts = [grown(learnt, starts[0]), *starts]
     argument = records[0] if len(records) == 1 else tuple(records)
     return maximise(
         model,

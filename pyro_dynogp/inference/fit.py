@@ -21,7 +21,7 @@ from pyro_dynogp.inference.maximum import Optimizer, Optimum, maximise
 from pyro_dynogp.inference.posterior import Hyperparameters, posterior_of
 from pyro_dynogp.inference.result import Fit, Method
 from pyro_dynogp.inference.sampling import sample_posterior
-from pyro_dynogp.inference.starts import starting_values
+from pyro_dynogp.inference.starts import grown, starting_values
 from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.linear import LinearDynamicGP
 from pyro_dynogp.parallel import seeded
@@ -37,6 +37,7 @@ def fit(
     method: Method | None = None,
     guide: GuideChoice = None,
     hyperparameters: Hyperparameters | None = None,
+    start: Fit | None = None,
     seed: int = 0,
     restarts: int | None = None,
     steps: int | None = None,
@@ -74,6 +75,8 @@ def fit(
             poles, gains, noise, lengthscales at the optimum, as the paper does; "normal" gives
             all sites independent normals; "multivariate normal" one for all sites, which is best
             for small models with well-excited inputs.
+        start: a fit to start from beside the restarts: of the same model to other data, or of a
+            model that this one extends (what sites have in common is taken over).
         seed: the same seed gives the same numbers to the last bit on one machine.
         restarts: number of starting points (default 6; 8 for a cascade, 2 with trajectories as
             sites).
@@ -117,6 +120,13 @@ def fit(
         )
     if guide is not None and not cascade:
         raise invalid("guide", expected="None for a linear model, which is exact", got=repr(guide))
+    if start is not None and isinstance(start.model, Cascade) != cascade:
+        kind = "a cascade" if cascade else "a linear model"
+        got = type(start.model).__name__
+        raise invalid("start", expected=f"a fit of {kind}", got=f"one of {got}")
+    if start is not None and cascade and guide not in (None, "collapsed"):
+        raise invalid("start", expected="None with this guide", got="a fit")
+    learnt = None if start is None else dict(start.mode)
     records = model.check(record)
     model = model.scaled_to(records)
     argument = records[0] if isinstance(record, Record) else records
@@ -128,6 +138,7 @@ def fit(
         _identity(guide),
         hyperparameters,
         (seed, restarts, steps, optimizer, draws, chains, warmup, particles, learning_rate),
+        *([] if learnt is None else [{name: v.tolist() for name, v in learnt.items()}]),
     )
     if isinstance(model, Cascade) and guide not in (None, "collapsed"):
         if method != "svi":
@@ -149,15 +160,19 @@ def fit(
     if isinstance(model, Cascade):
         target: Any = model.collapsed
         optima = best_optima(
-            target, records, restarts, steps or 600, optimizer, seed, workers, progress, kept
-        )
+            target, records, restarts, steps or 600, optimizer, seed, workers, progress, kept,
+            learnt,
+        )  # fmt: skip
     else:
         target = model
         climb = steps if steps is not None and method == "map" else None
+        starts = starting_values(model, records, count=restarts, seed=seed)
+        if learnt is not None:
+            starts = [grown(learnt, starts[0]), *starts]
         optima = maximise(
             model,
             argument,
-            starting_values(model, records, count=restarts, seed=seed),
+            starts,
             optimizer=optimizer,
             steps=climb or (500 if optimizer == "lbfgs" else 1500),
             seed=seed,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -42,6 +42,24 @@ def starting_values(
         candidates.append(values_given_poles(model, records, scaling, poles))
     candidates.sort(key=lambda candidate: candidate[0])
     return [values for _, values in candidates[:count]]
+
+
+def grown(values: Mapping[str, Tensor], start: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """A start with what another fit has learnt: values of a smaller model, or of the same one.
+
+    Sites of one name and as many dimensions share their first rows and columns; the rest of the
+    start (new inputs, pairs, layers) stays as it is.
+    """
+    out = {}
+    for name, value in start.items():
+        new = value.clone()
+        if name in values and values[name].dim() == new.dim():
+            common = tuple(
+                slice(min(a, b)) for a, b in zip(new.shape, values[name].shape, strict=True)
+            )
+            new[common] = values[name][common]
+        out[name] = new
+    return out
 
 
 def random_poles(pairs: int, scaling: Scaling, generator: np.random.Generator) -> np.ndarray:

@@ -339,3 +339,13 @@ def test_divergence_names_parameters_and_keeps_the_last_good_ones(bent):
     assert "dynamic layer g" in str(error)
     again = pickle.loads(pickle.dumps(error))  # it may come from another process
     assert (str(again), again.sites) == (str(error), error.sites)
+
+
+def test_a_warm_start_goes_on_from_another_fit(bent):
+    model = dgp.Wiener(1, **SMALL)
+    options = {"method": "map", "restarts": 1, "workers": 1, "progress": False}
+    long = dgp.fit(model, bent[:80], steps=150, **options)
+    warm = dgp.fit(model, bent[:80], steps=2, start=long, **options)
+    cold = dgp.fit(model, bent[:80], steps=2, **options)
+    assert warm.start_energies[0] <= long.start_energies[0] + 1e-6
+    assert warm.start_energies[0] < cold.start_energies[0]

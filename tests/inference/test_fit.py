@@ -225,3 +225,25 @@ def test_summary_names_poles_and_noise(map_fit):
     text = map_fit.summary()
     assert "natural frequency" in text
     assert f"{map_fit.noise_sd[0]:.4g}" in text
+
+
+class TestWarmStart:
+    def test_goes_on_from_another_fit(self, record, map_fit):
+        model = dgp.LinearDynamicGP(inputs=1, pairs=1)
+        options = {"restarts": 1, "steps": 2, "workers": 1, "progress": False}
+        cold = dgp.fit(model, record[:160], **options)
+        warm = dgp.fit(model, record[:160], start=map_fit, **options)
+        assert warm.start_energies[0] <= map_fit.start_energies[0] + 1e-6
+        assert warm.start_energies[0] < cold.start_energies[0] - 1.0
+
+    def test_a_larger_model_keeps_what_a_smaller_one_has_learnt(self, record, map_fit):
+        wider = dgp.fit(
+            dgp.LinearDynamicGP(inputs=1, pairs=2), record[:160], start=map_fit,
+            restarts=1, steps=200, workers=1, progress=False,
+        )  # fmt: skip
+        near = np.abs(wider.modes.poles.numpy() - complex(map_fit.modes.poles[0]))
+        assert near.min() < 0.3 * abs(complex(map_fit.modes.poles[0]))
+
+    def test_of_another_kind_is_refused(self, record, map_fit):
+        with pytest.raises(ValueError, match="start: expected a fit of a cascade"):
+            dgp.fit(dgp.Wiener(1, pairs=1, inducing=5), record[:60], start=map_fit)
