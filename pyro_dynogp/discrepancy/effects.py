@@ -72,6 +72,7 @@ from pyro_dynogp.discrepancy.shape_effects import (
 from pyro_dynogp.discrepancy.time_effects import drift, level_shift
 from pyro_dynogp.discrepancy.trials import Score
 from pyro_dynogp.layers.noise import Heteroscedastic, StudentT
+from pyro_dynogp.models.linear import LinearDynamicGP
 from pyro_dynogp.record import Record
 
 # One zone for each common rule of daylight saving: clocks tell zones apart by their transitions.
@@ -199,7 +200,8 @@ class DeadTime(Effect):
         """
         channel, more = str(evidence.where["channel"]), _number(evidence, "delay")
         step = record.sampling_time
-        count = max(2, int(1.5 * np.log2(len(record) / 10.0)))
+        finest = 1.5 if isinstance(model, LinearDynamicGP) else 0.75  # refits of cascades take long
+        count = max(2, int(finest * np.log2(len(record) / 10.0)))
         grid = {float(d) for d in step * np.geomspace(1.0, len(record) / 10.0, count)}
         around = {share * more for share in AROUND}
         prepared = model.check(record)[0]

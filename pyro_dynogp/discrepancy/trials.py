@@ -231,14 +231,14 @@ def _cascade(
     target = model.collapsed
     before = None if base is None else base.model
     warm = isinstance(before, Cascade) and len(before.layers) == len(model.layers)
-    linear = LINEAR_STEPS // 3 if warm else LINEAR_STEPS
+    linear = (5 if short else LINEAR_STEPS // 3) if warm else LINEAR_STEPS
     starts = starting_points(
         target, records, 1 if warm else count, linear, seed, 1, False, NOTHING_KEPT
     )
     if warm:
         assert base is not None
         learnt = grown(base.mode, starts[0])
-        starts, steps = ([learnt], steps // 4) if short else ([learnt, starts[0]], steps // 2)
+        starts, steps = ([learnt], steps // 5) if short else ([learnt, starts[0]], steps // 2)
     return maximise(
         target, records[0], starts, optimizer="adam", steps=steps, seed=seed, workers=1, kept=0.5
     )

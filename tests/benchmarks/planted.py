@@ -48,22 +48,32 @@ def cases_of(
     effects: Sequence[str | None] | None = None,
     split: str = "development",
     strengths: Sequence[Strength] = STRENGTHS,
+    kind: str | None = None,
 ) -> list[Case]:
     """Every effect at every strength, and as many null plants as an effect has plants.
 
-    Sorted by replicate: what there is of an interrupted study is balanced.
+    Sorted by replicate: what there is of an interrupted study is balanced. With a kind ("linear",
+    "wiener") replicates are the first plants whose model to start from is of that kind.
     """
     chosen = (None, *EFFECTS) if effects is None else effects
+    count = len(strengths)
     found = []
-    for replicate in range(replicates):
-        for effect in chosen:
-            if effect is None:
-                count = len(strengths)
-                numbers = range(count * replicate, count * (replicate + 1))
-                found += [Case(None, "none", number, split) for number in numbers]
-            else:
-                found += [Case(effect, strength, replicate, split) for strength in strengths]
-    return found
+    for effect in chosen:
+        many = count * replicates if effect is None else replicates
+        levels = ("none",) if effect is None else strengths
+        for level in levels:
+            numbers = [n for n in range(20 * many if kind else many) if
+                       kind is None or _kind(effect, level, n, split) == kind]  # fmt: skip
+            order = [k // count if effect is None else k for k in range(many)]
+            found += [
+                (k, Case(effect, level, n, split)) for k, n in zip(order, numbers, strict=False)
+            ]
+    return [case for _, case in sorted(found, key=lambda one: one[0])]
+
+
+def _kind(effect: str | None, level: str, number: int, split: str) -> str:
+    strength = cast(Strength, "middle" if effect is None else level)
+    return str(plant(effect, strength, number, samples=SAMPLES, split=split).base["kind"])
 
 
 def base_model(base: Mapping[str, Any], inputs: int) -> Any:
@@ -167,6 +177,7 @@ def run(
     workers: int | None = None,
     split: str = "development",
     strengths: Sequence[Strength] = STRENGTHS,
+    kind: str | None = None,
 ) -> str:
     """Run what is missing of the study and tabulate all of it.
 
@@ -177,10 +188,10 @@ def run(
         effects: names, None among them for null plants; by default all.
         workers: processes, None for all processors.
         split: "development", or "final" for the plants that nothing was tuned on.
-        strengths: that are planted.
+        strengths: that are planted. kind: of the models to start from, "linear" or "wiener".
     """
     path = folder / f"planted.{split}.jsonl"
-    wanted = cases_of(replicates, effects, split, strengths)
+    wanted = cases_of(replicates, effects, split, strengths, kind)
     rows = {
         (r["effect"], r["strength"], r["replicate"], r["split"]): r
         for r in read_rows(path)
