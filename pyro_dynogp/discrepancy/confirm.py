@@ -47,17 +47,18 @@ class Confirmed:
 
 @dataclass(frozen=True, eq=False)
 class _Judged:
-    """A candidate, its refit, and its gain over the model without it."""
+    """A candidate, its refit, its gain over the model without it, and whether forecasts suffer."""
 
     found: Found
     kind: Kind
     tried: Tried
     attempt: Attempt
+    harms: bool = False
 
     @property
     def helps(self) -> bool:
         a = self.attempt
-        return bool(a.gain > NATS and a.gain > ERRORS * a.gain_error)
+        return bool(a.gain > NATS and a.gain > ERRORS * a.gain_error) and not self.harms
 
 
 def confirm(
@@ -170,8 +171,14 @@ def _judge(found: Found, kind: Kind, tried: Tried, base: Tried, number: int) -> 
     d = tried.densities - base.densities
     gain, error = float(d.sum()), block_standard_error(d)[0]
     reason = f"held-out elpd {gain:+.1f} +- {error:.1f} nats"
+    harms = False
+    if len(tried.forecasts):  # what is one step ahead for the noise must not cost the structure
+        d = tried.forecasts - base.forecasts
+        loss, spread = -float(d.sum()), block_standard_error(d)[0]
+        harms = loss > max(NATS, ERRORS * spread)
+        reason += f"; forecasts worse by {loss:.1f} +- {spread:.1f}" if harms else ""
     attempt = Attempt(number, evidence, q, "rejected", reason, gain, error, tried.seconds)
-    return _Judged(found, kind, tried, attempt)
+    return _Judged(found, kind, tried, attempt, harms)
 
 
 def _first_in_line(better: Sequence[_Judged], level: float) -> list[_Judged]:

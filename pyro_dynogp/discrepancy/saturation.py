@@ -23,6 +23,8 @@ from pyro_dynogp.discrepancy.ties import Ties, ties_at_the_top
 
 # Exact ties as improbable as this are a limit, and name it.
 TIED = 0.01
+# Largest slope beyond a limit, as a share of that before it: what goes on rising is no limit.
+FLAT = 0.3
 # Quantiles of the mean above which it may flatten; below, their complements.
 UPPER = np.array([0.5, 0.6, 0.7, 0.8, 0.9, 0.95])
 
@@ -31,8 +33,8 @@ def saturation(residuals: Residuals, *, seed: int = 0) -> Evidence:
     """Test whether the output stops at an upper or a lower limit.
 
     Two signs, of which either does: exact ties at the largest or smallest measured value (see
-    `ties_at_the_top`), and an output that flattens where the mean goes on. `where`: low, high
-    [output], infinite where there is none.
+    `ties_at_the_top`), and an output that flattens where the mean goes on: to less than 0.3 of its
+    slope, or it is another nonlinearity. `where`: low, high [output], infinite where there is none.
 
     Raises:
         ValueError: where fewer than 30 samples are held out and measured.
@@ -61,7 +63,8 @@ def saturation(residuals: Residuals, *, seed: int = 0) -> Evidence:
         counts = [str(t.count) for t, at in ((bottom, low), (top, high)) if np.isfinite(at)]
         how = f" ({' and '.join(counts)} samples at exactly that value)"
     else:
-        low, high = _flat_limits(r, knots[found.best], p < NOTICED)
+        low, high, slope = _flat_limits(r, knots[found.best], p < NOTICED)
+        p = 1.0 if p < NOTICED and slope > FLAT else p
         how = ""
     limits = [f"{at:.4g}{unit(r.output_unit)}" for at in (low, high) if np.isfinite(at)]
     flattened = np.clip(r.mean, low, high)
@@ -96,8 +99,12 @@ def _clipped(mean: np.ndarray, low: float, high: float) -> np.ndarray:
     return with_past(np.clip(mean, low, high) - mean)
 
 
-def _flat_limits(r: Residuals, knot: tuple[float, float], finer: bool) -> tuple[float, float]:
-    """Output at the knots: the mean of a model that was fitted to a flattened output is too flat.
+def _flat_limits(
+    r: Residuals, knot: tuple[float, float], finer: bool
+) -> tuple[float, float, float]:
+    """Output at the knots, and the slope beyond them as a share of that between them.
+
+    The mean of a model that was fitted to a flattened output is too flat.
 
     With a finer look the knots are first moved to where they explain most.
     """
@@ -108,8 +115,8 @@ def _flat_limits(r: Residuals, knot: tuple[float, float], finer: bool) -> tuple[
         low, high = located_limits(r, lambda a, b: np.clip(m, a, b) - m, knot, grid, m[:, None])
     there = r.held_out & np.isfinite(r.output)
     columns = np.column_stack([np.ones(len(r)), m, np.clip(m, low, high) - m])
-    a, b, _ = np.linalg.lstsq(columns[there], r.output[there], rcond=1e-8)[0]
-    return float(a + b * low), float(a + b * high)
+    a, b, c = np.linalg.lstsq(columns[there], r.output[there], rcond=1e-8)[0]
+    return float(a + b * low), float(a + b * high), float((b - c) / b) if b else 1.0
 
 
 def _cut(top: Ties, bottom: Ties, low: float, high: float) -> float:

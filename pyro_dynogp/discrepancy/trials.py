@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -78,6 +78,7 @@ class Tried:
             [nats].
         seconds: it took. failure: why there is no result, "" if there is one.
         fit: of the model to the first fold's training data.
+        forecasts: (N,) where densities are one step ahead, those of forecasts beside them.
     """
 
     model: Model
@@ -85,6 +86,7 @@ class Tried:
     seconds: float
     failure: str = ""
     fit: Fit | None = None
+    forecasts: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
 def run(trial: Trial) -> Tried:
@@ -121,7 +123,7 @@ def run(trial: Trial) -> Tried:
         for times in range(REFINEMENTS):
             look(trial.refine(unscaled(best()), times))
     model = unscaled(best())
-    parts, first = [], best()
+    parts, beside, first = [], [np.zeros(0)], best()
     try:
         for index, fold in enumerate(trial.folds):
             if index == 0:
@@ -132,12 +134,15 @@ def run(trial: Trial) -> Tried:
                 rest = without(trial.record, fold)
                 found = quick_fit(model, rest, trial.poles, trial.seed, trial.base)
             parts.append(held_out_density(found, trial.record, fold, trial.score))
+            if trial.score == "one step":
+                beside.append(held_out_density(found, trial.record, fold, "forecast"))
     except ValueError as error:
         problems.append(str(error))
         parts = [np.zeros(0)]
     seconds = time.perf_counter() - begin
     failure = problems[-1] if not len(parts[0]) else ""
-    return Tried(model, np.concatenate(parts), seconds, failure, first)
+    densities, forecasts = np.concatenate(parts), np.concatenate(beside)
+    return Tried(model, densities, seconds, failure, first, forecasts)
 
 
 def without(record: Record, fold: np.ndarray) -> Record:
