@@ -30,7 +30,10 @@ HARMONICS = 4
 
 
 def periodic_disturbance(residuals: Residuals, *, seed: int = 0) -> Evidence:
-    """A sine of any period in what was held out, beside what the inputs explain.
+    """A sine of any period in the residual, beside what the inputs explain; all samples.
+
+    Lines need length: what was fitted to is looked at, too. A fit can take part of a line up, not
+    make one.
 
     Frequencies from three cycles in what is looked at to half the sampling rate, four for each
     1 / duration; the best is refined between its neighbours. Periods that fit the harmonics 2 to 4
@@ -44,7 +47,7 @@ def periodic_disturbance(residuals: Residuals, *, seed: int = 0) -> Evidence:
         where: period [time unit].
 
     Raises:
-        ValueError: where fewer than 30 held-out samples are measured, or steps are irregular.
+        ValueError: where fewer than 30 samples are measured, or steps are irregular.
 
     Source: harmonic F test, Thomson, Proc. IEEE 70(9):1055 (1982), with one taper, in the whitened
     residual; the largest over frequencies as in Fisher, Proc. R. Soc. A 125:54 (1929).
@@ -53,11 +56,11 @@ def periodic_disturbance(residuals: Residuals, *, seed: int = 0) -> Evidence:
     at = _slots(r)
     n = int(at[-1]) + 1
     x = np.full(n, np.nan)
-    x[at] = np.where(r.held_out, r.residual, np.nan)
+    x[at] = r.residual
     looked = np.flatnonzero(np.isfinite(x))
     span = int(looked[-1] - looked[0]) + 1 if len(looked) else 0
     if len(looked) < 30:
-        raise invalid("residuals", expected="at least 30 held-out samples", got=str(len(looked)))
+        raise invalid("residuals", expected="at least 30 measured samples", got=str(len(looked)))
     # Only what is looked at counts, so that the grid is no finer than it need be.
     x, kept = x[looked[0] : looked[-1] + 1], (at >= looked[0]) & (at <= looked[-1])
     beside = own(r)[kept]

@@ -1,0 +1,185 @@
+"""Which of the effects that help comes first, what they are scored on, which variants there are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import pyro_dynogp as dgp
+from pyro_dynogp.channels import Calendar, Delayed, ShiftedClock
+from pyro_dynogp.discrepancy import effects
+from pyro_dynogp.discrepancy.blocks import shared
+from pyro_dynogp.discrepancy.confirm import _first_in_line, _judge, _Judged, confirm
+from pyro_dynogp.discrepancy.evidence import Evidence
+from pyro_dynogp.discrepancy.search import Found
+from pyro_dynogp.discrepancy.trials import Tried, interleaved, stretches
+from tests.discrepancy.test_loop import fitted, machine
+
+MODEL = dgp.LinearDynamicGP(inputs=1, pairs=1)
+
+
+def spoken_for(effect: effects.Effect, p: float, q: float, **where: Any) -> Found:
+    evidence = Evidence(effect.name, 1.0, p, 1.0, 1.0, where, "It is so.", None)
+    return Found(effect, evidence, q)
+
+
+def tried(gains: np.ndarray, **options: Any) -> Tried:
+    return Tried(MODEL, gains, 0.0, **options)
+
+
+def helping(effect: effects.Effect, p: float, q: float, gain: float = 50.0) -> _Judged:
+    n = 100
+    kind = ("after", effect.score)
+    noise = np.random.default_rng(0).normal(0.0, 0.1, n)
+    found = spoken_for(effect, p, q)
+    return _judge(found, kind, tried(noise + gain / n), tried(np.zeros(n)), 1)
+
+
+def names(judged: list[_Judged]) -> list[str]:
+    return [one.found.effect.name for one in judged]
+
+
+def test_structure_comes_before_noise() -> None:
+    both = [helping(effects.HeavyTails(), 1e-9, 1e-8), helping(effects.Drift(), 1e-3, 1e-2)]
+    assert names(_first_in_line(both, 0.05)) == ["drift"]
+
+
+def test_what_was_only_tried_beside_a_relative_does_not_beat_a_certain_cause() -> None:
+    step, lucky = helping(effects.LevelShift(), 1e-9, 1e-8), helping(effects.ExtraInput(), 0.2, 1.0)
+    assert names(_first_in_line([lucky, step], 0.05)) == ["level shift"]
+    relative = helping(effects.Drift(), 0.2, 1.0)  # of the same family
+    assert names(_first_in_line([relative, step], 0.05)) == ["drift", "level shift"]
+    own = helping(effects.ExtraInput(), 0.01, 0.2)  # its own test rejects
+    assert names(_first_in_line([own, step], 0.05)) == ["extra input", "level shift"]
+    assert names(_first_in_line([lucky], 0.05)) == ["extra input"]
+
+
+def test_noise_that_costs_the_forecasts_does_not_help() -> None:
+    n, found = 100, spoken_for(effects.HeavyTails(), 1e-9, 1e-8)
+    base = tried(np.zeros(n), forecasts=np.zeros(n))
+    good = _judge(found, ("after", "one step"), tried(np.ones(n), forecasts=np.zeros(n)), base, 1)
+    bad = _judge(
+        found, ("after", "one step"), tried(np.ones(n), forecasts=np.full(n, -0.5)), base, 1
+    )
+    assert good.helps
+    assert not bad.helps
+    assert "forecasts worse by 50.0" in bad.attempt.reason
+
+
+def test_folds_have_data_on_either_side_of_every_instant() -> None:
+    first, second = interleaved(240)
+    assert not (first & second).any()
+    assert not (first | second)[:20].any()  # the past of the first forecast
+    assert [part.stop - part.start for part in stretches(first)] == [20] * 6
+    assert stretches(np.array([True, False, True, True])) == [slice(0, 1), slice(2, 4)]
+
+
+def test_half_of_the_block_that_is_searched_can_be_fitted_to() -> None:
+    held_out = np.arange(480) >= 240
+    some = shared(held_out)
+    assert some.sum() == 120
+    assert some[-1]
+    assert not some[:240].any()
+    assert not some[240]
+
+
+@pytest.mark.parametrize("instant", [150, 300])
+def test_a_step_is_added_wherever_it_is(instant: int) -> None:
+    """Beside a drift, which is scored on other samples, and is worse on the same."""
+    record = machine(seed=3)
+    y = record.outputs[:, 0] + 0.3 * (np.arange(len(record)) >= instant)
+    record = record.with_outputs(y)
+    looked_for = (effects.LevelShift(), effects.Drift())
+    report = dgp.close_loop(
+        fitted(record), record, effects=looked_for, max_rounds=1, workers=1, progress=False
+    )
+    assert [one.name for one in report.effects] == ["level shift"]
+    assert report.after["rmse"] < 0.06
+    mean, sd = next(iter(report.effects[0].parameters.values()))
+    assert mean == pytest.approx(0.3, abs=4.0 * sd + 0.01)
+
+
+def test_the_fit_of_the_winner_is_handed_on() -> None:
+    record = machine(weight=0.3)
+    fit = fitted(record)
+    held_out = np.arange(360) >= 240
+    where = {"channel": "heat", "form": "linear", "delay": 0.0}
+    found = spoken_for(effects.ExtraInput(), 1e-9, 1e-8, **where)
+    model = replace(fit.model, scaling=None)
+    variants = tuple(found.effect.extend(model, found.evidence, record))
+    done = confirm(
+        [(found, variants)], fit, record[:360], held_out, None,
+        number=1, seed=0, level=0.05, workers=1,
+    )  # fmt: skip
+    assert done.winner is found
+    assert done.fit is not None
+    assert done.fit.model.inputs == 2
+    assert len(done.fit.records[0]) == 240  # to what is not held out
+
+
+def two_inputs() -> dgp.Record:
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal((300, 2))
+    return dgp.Record(np.arange(300) * 3600.0, u, u[:, :1], start="2023-03-01T00:00:00+01:00",
+                      time_unit="s", input_names=("a", "b"))  # fmt: skip
+
+
+def test_inputs_are_delayed_alone_and_together() -> None:
+    record, model = two_inputs(), dgp.LinearDynamicGP(inputs=2, pairs=1)
+    found = spoken_for(effects.DeadTime(), 0.01, 0.1, channel="a", delay=7200.0)
+    variants = effects.DeadTime().extend(model, found.evidence, record)
+    sets = {tuple(c.channel for c in one.channels) for one in variants}
+    assert sets == {("a",), ("b",), ("a", "b")}
+    together = [one for one in variants if len(one.channels) == 2]
+    assert all(a.delay == b.delay for a, b in (one.channels for one in together))
+    finer = effects.DeadTime().refine(together[0], 0)
+    assert {len({c.delay for c in one.channels}) for one in finer} == {1}
+    assert "Channels 'a' and 'b' act" in effects.DeadTime().sentence(found.evidence, together[0])
+    again = effects.DeadTime().extend(together[0], found.evidence, record)
+    assert all(isinstance(c, Delayed) for one in again for c in one.channels)
+    assert all(len({c.channel for c in one.channels}) == len(one.channels) for one in again)
+
+
+def test_a_clock_may_be_wrong_for_all_inputs() -> None:
+    record, model = two_inputs(), dgp.LinearDynamicGP(inputs=2, pairs=1)
+    found = spoken_for(effects.ClockShift(), 0.01, 0.1, channel="a", shift=3600.0, time=360000.0)
+    alone, together = effects.ClockShift().extend(model, found.evidence, record)
+    assert [c.channel for c in alone.channels] == ["a"]
+    assert [c.channel for c in together.channels] == ["a", "b"]
+    assert all(isinstance(c, ShiftedClock) for c in together.channels)
+
+
+def test_a_calendar_moves_to_another_clock_instead_of_being_there_twice() -> None:
+    record = two_inputs()
+    there = Calendar("hour of day by weekend", "UTC", 4)
+    count = len(there.names)
+    model = dgp.LinearDynamicGP(inputs=2 + count, direct=count, channels=(there,), pairs=1)
+    what = "hour of day by weekday/weekend"
+    found = spoken_for(effects.CalendarEffect(), 0.01, 0.1, what=what, zone="Australia/Melbourne")
+    variants = effects.CalendarEffect().extend(model, found.evidence, record)
+    assert [[(c.what, c.zone, c.harmonics) for c in one.channels] for one in variants] == [
+        [("hour of day by weekend", "Australia/Melbourne", 6)],
+        [("hour of day by weekend", "Australia/Melbourne", 4)],
+    ]
+    assert all(one.inputs - one.direct == 2 for one in variants)
+    assert [one.check(record)[0].n_inputs for one in variants] == [v.inputs for v in variants]
+    same = spoken_for(effects.CalendarEffect(), 0.01, 0.1, what=what, zone="UTC")
+    (finer,) = effects.CalendarEffect().extend(model, same.evidence, record)
+    assert [c.harmonics for c in finer.channels] == [8]
+
+
+def test_feedback_is_among_the_effects_and_changes_nothing() -> None:
+    class Certain(effects.Feedback):
+        def detect(self, residuals: Any, seed: int = 0) -> list[Evidence]:
+            return [spoken_for(self, 1e-9, 1e-9, channel="u").evidence]
+
+    record = machine(seed=5)
+    report = dgp.close_loop(
+        fitted(record), record, effects=(Certain(),), max_rounds=1, workers=1, progress=False
+    )
+    assert [one.name for one in report.effects] == ["feedback"]
+    assert report.before == report.after
+    assert "feedback" in str(report)
