@@ -184,19 +184,22 @@ def _judge(found: Found, kind: Kind, tried: Tried, base: Tried, number: int) -> 
 def _first_in_line(better: Sequence[_Judged], level: float) -> list[_Judged]:
     """Of effects that help those that the residual itself speaks for, structure before noise.
 
-    What was only tried beside a relative does not count where some cause of another family is
-    certain: with eight candidates one improves on held-out data by luck. And gains of forecasts and
-    of one step ahead do not compare: first comes what lies between inputs and output, whose lack
-    looks like noise, and noise when nothing of that kind is left.
+    Gains of forecasts and of one step ahead do not compare: first comes what lies between inputs
+    and output, whose lack looks like noise, and noise when nothing of that kind is left.
+
+    With eight candidates one improves on held-out data by luck, and flexible ones take up much of
+    what others should. Where the residual is certain of an effect (by its false discovery rate)
+    only that and its relatives count, of structure; where it is certain of noise alone, structure
+    whose own test rejects.
     """
-    certain = {one.found.effect.family for one in better if one.found.q_value <= level}
-    if certain:
-        better = [
-            one for one in better
-            if one.found.evidence.p_value <= level or one.found.effect.family in certain
-        ]  # fmt: skip
     structural = [one for one in better if one.kind[1] == "forecast"]
-    return structural or list(better)
+    certain = {one.found.effect.family for one in structural if one.found.q_value <= level}
+    if certain:
+        return [one for one in structural if one.found.effect.family in certain]
+    noise = [one for one in better if one.kind[1] != "forecast"]
+    if any(one.found.q_value <= level for one in noise):
+        structural = [one for one in structural if one.found.evidence.p_value <= level]
+    return structural or noise
 
 
 def _best(judged: Sequence[_Judged]) -> _Judged:

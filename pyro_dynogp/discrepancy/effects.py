@@ -42,7 +42,7 @@ from pyro_dynogp.channels.base import signal_of
 from pyro_dynogp.channels.clock import DAY
 from pyro_dynogp.discrepancy.calendar_effects import calendar
 from pyro_dynogp.discrepancy.clock_effects import clock_shift
-from pyro_dynogp.discrepancy.evidence import Evidence, Residuals
+from pyro_dynogp.discrepancy.evidence import Curve, Evidence, Residuals
 from pyro_dynogp.discrepancy.extend import (
     Model,
     has_process_noise,
@@ -85,6 +85,8 @@ CALENDAR_PARTS = {
     "hour of day by weekday/weekend": "hour of day by weekend",
     "season": "time of year",
 }
+# Share of a drift's variance from which it counts as a straight line.
+STRAIGHT = 0.95
 # Share of its estimate by which a limit or a width may be off, tried by refits, and then finer.
 AROUND = (0.75, 1.0, 1.3)
 FINER = ((0.88, 1.13), (0.95, 1.05))
@@ -365,9 +367,15 @@ class Drift(Effect):
     test = staticmethod(drift)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
-        """A straight line in time, or each input times it."""
+        """A straight line in time or, where it bends, a random path; or each input times a line.
+
+        The random path is a pair of poles, as slow as suits it, that process noise drives: a line
+        through a bend would go on to where nothing is.
+        """
         begin, end = float(record.time[0]), float(record.time[-1])
         if evidence.where["form"] == "additive":
+            if evidence.curve is not None and _straightness(evidence.curve) < STRAIGHT:
+                return [with_process_noise(with_pairs(model, 1))]
             return [with_channel(model, Trend(begin, end))]
         extended = model
         prepared = model.check(record)[0]
@@ -377,6 +385,15 @@ class Drift(Effect):
                 extended, TrendOfGain(name, _centre(prepared, name), begin, end)
             )
         return [extended]
+
+
+def _straightness(curve: Curve) -> float:
+    """Share of a curve's variance that a straight line has."""
+    there = np.isfinite(curve.x) & np.isfinite(curve.fitted)
+    x, y = curve.x[there], curve.fitted[there]
+    if len(x) < 3 or not np.std(y) or not np.std(x):
+        return 1.0
+    return float(np.corrcoef(x, y)[0, 1] ** 2)
 
 
 class LevelShift(Effect):

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 import pyro_dynogp as dgp
 from pyro_dynogp import datasets
@@ -101,7 +102,7 @@ def electricity(zone: str, missing: str, drop: Sequence[str] = ()) -> Case:
         inputs=record.n_inputs + direct, direct=direct, channels=channels, pairs=1
     )
     assert record.timestamps is not None
-    training = int(np.searchsorted(record.timestamps, np.datetime64("2012-12-31T13:00")))
+    training = int(np.searchsorted(record.timestamps, pd.Timestamp("2013-01-01", tz=HOME)))
     return Case(record, model, training, missing)
 
 

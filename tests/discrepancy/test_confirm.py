@@ -47,14 +47,21 @@ def test_structure_comes_before_noise() -> None:
     assert names(_first_in_line(both, 0.05)) == ["drift"]
 
 
-def test_what_was_only_tried_beside_a_relative_does_not_beat_a_certain_cause() -> None:
+def test_only_relatives_stand_beside_a_certain_cause() -> None:
     step, lucky = helping(effects.LevelShift(), 1e-9, 1e-8), helping(effects.ExtraInput(), 0.2, 1.0)
     assert names(_first_in_line([lucky, step], 0.05)) == ["level shift"]
     relative = helping(effects.Drift(), 0.2, 1.0)  # of the same family
     assert names(_first_in_line([relative, step], 0.05)) == ["drift", "level shift"]
-    own = helping(effects.ExtraInput(), 0.01, 0.2)  # its own test rejects
-    assert names(_first_in_line([own, step], 0.05)) == ["extra input", "level shift"]
+    other = helping(effects.ExtraInput(), 1e-4, 1e-3)
+    assert names(_first_in_line([other, step], 0.05)) == ["extra input", "level shift"]
     assert names(_first_in_line([lucky], 0.05)) == ["extra input"]
+
+
+def test_where_noise_alone_is_certain_structure_must_speak_for_itself() -> None:
+    tails = helping(effects.HeavyTails(), 1e-9, 1e-8)
+    lucky, own = (helping(effects.ExtraInput(), p, 0.5) for p in (0.2, 0.01))
+    assert names(_first_in_line([lucky, tails], 0.05)) == ["heavy tails"]
+    assert names(_first_in_line([own, tails], 0.05)) == ["extra input"]
 
 
 def test_noise_that_costs_the_forecasts_does_not_help() -> None:
