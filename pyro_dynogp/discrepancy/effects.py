@@ -42,6 +42,7 @@ from pyro_dynogp.channels.base import signal_of
 from pyro_dynogp.channels.clock import DAY
 from pyro_dynogp.discrepancy.calendar_effects import calendar
 from pyro_dynogp.discrepancy.clock_effects import clock_shift
+from pyro_dynogp.discrepancy.delays import likely_delays
 from pyro_dynogp.discrepancy.evidence import Curve, Evidence, Residuals
 from pyro_dynogp.discrepancy.extend import (
     Model,
@@ -72,7 +73,6 @@ from pyro_dynogp.discrepancy.shape_effects import (
 from pyro_dynogp.discrepancy.time_effects import drift, level_shift
 from pyro_dynogp.discrepancy.trials import Score
 from pyro_dynogp.layers.noise import Heteroscedastic, StudentT
-from pyro_dynogp.models.linear import LinearDynamicGP
 from pyro_dynogp.record import Record
 
 # One zone for each common rule of daylight saving: clocks tell zones apart by their transitions.
@@ -85,6 +85,8 @@ CALENDAR_PARTS = {
     "hour of day by weekday/weekend": "hour of day by weekend",
     "season": "time of year",
 }
+# Delays that are tried whatever the data say.
+COARSE = 5
 # Share of a drift's variance from which it counts as a straight line.
 STRAIGHT = 0.95
 # Share of its estimate by which a limit or a width may be off, tried by refits, and then finer.
@@ -196,25 +198,28 @@ class DeadTime(Effect):
         return [replace(e, where={**e.where, "time_unit": residuals.time_unit}) for e in found]
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
-        """Each input, and all of them, delayed: by the estimate, and up to a tenth of the record.
+        """Each input, and all of them, delayed: by what regressions and the evidence say, and more.
 
         Poles make up for much of a delay, so that estimates of it are rough.
         """
         channel, more = str(evidence.where["channel"]), _number(evidence, "delay")
-        step = record.sampling_time
-        finest = 1.5 if isinstance(model, LinearDynamicGP) else 0.75  # refits of cascades take long
-        count = max(2, int(finest * np.log2(len(record) / 10.0)))
-        grid = {float(d) for d in step * np.geomspace(1.0, len(record) / 10.0, count)}
+        step, longest = record.sampling_time, len(record) // 10
+        grid = {float(d) for d in step * np.geomspace(1.0, longest, COARSE)}
         around = {share * more for share in AROUND}
         prepared = model.check(record)[0]
         names = prepared.input_names[: prepared.n_inputs - model.direct]
-        places = [(name,) for name in names] + ([names] if len(names) > 1 else [])
-        return [
-            later
-            for place in places
-            for delay in sorted(grid | around if channel in place else grid)
-            if (later := _later(model, place, delay, 0.2 * step)) is not None
-        ]
+        places: list[tuple[int, ...]] = [(k,) for k in range(len(names))]
+        if len(names) > 1:
+            places.append(tuple(range(len(names))))
+        variants = []
+        for place in places:
+            chosen = tuple(names[k] for k in place)
+            u, y = prepared.inputs[:, : len(names)], prepared.outputs[:, 0]
+            found = {step * d for d in likely_delays(y, u, place, longest)}
+            delays = grid | found | (around if channel in chosen else set())
+            tried = (_later(model, chosen, delay, 0.2 * step) for delay in sorted(delays))
+            variants += [one for one in tried if one is not None]
+        return variants
 
     def sentence(self, evidence: Evidence, model: Model) -> str:
         """The channels and their delay as refits have them."""
@@ -290,7 +295,7 @@ class Saturation(OutputNonlinearity):
 
     name = "saturation"
     family = "shapes"
-    freedom = 3
+    freedom = 1
     test = staticmethod(saturation)
 
 

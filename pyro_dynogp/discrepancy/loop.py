@@ -23,7 +23,7 @@ from pyro_dynogp.discrepancy.gate import structure_left
 from pyro_dynogp.discrepancy.noise_effects import data_faults
 from pyro_dynogp.discrepancy.report import Attempt, FoundEffect, Report
 from pyro_dynogp.discrepancy.residuals import residuals_of
-from pyro_dynogp.discrepancy.search import Found, candidates_of, look
+from pyro_dynogp.discrepancy.search import Found, candidates_of, look, merged
 from pyro_dynogp.discrepancy.trials import (
     at_mode,
     one_step_density,
@@ -35,6 +35,7 @@ from pyro_dynogp.inference.fit import fit as fit_model
 from pyro_dynogp.inference.result import Method
 from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.layers import Static
+from pyro_dynogp.models.linear import LinearDynamicGP
 from pyro_dynogp.parallel import parallel_map
 from pyro_dynogp.prediction.clock import joined
 from pyro_dynogp.prediction.scores import scores
@@ -113,7 +114,7 @@ def close_loop(
         clock.next("residual tests")
         if number == 1:
             warnings += [*_faults(residuals, data.known), *skipped]
-            reported = [f for f in found if not f.effect.added and f.q_value <= level]
+        reported = _reported(found, level)
         left = state.structure(residuals, found)
         chosen = candidates_of(found, model, data.known, level, tries) if left else []
         attempts += _untried(found, chosen, level, number)
@@ -136,6 +137,7 @@ def close_loop(
     else:  # rounds are spent; whether something is left is still to be said
         residuals, found, _ = state.look(current, {one.effect.name for one, _ in accepted})
         left = state.structure(residuals, found)
+        reported = _reported(found, level)
         clock.next("residual tests")
     fits = [first, current] if accepted else [first]
     fitted = _final(fits, data.known, workers, progress)
@@ -189,12 +191,24 @@ class _State:
     def look(
         self, fit: Fit, known: Collection[str]
     ) -> tuple[list[Residuals], list[Found], list[str]]:
-        """Residuals, evidence of all effects but those that are known, what was not tested."""
+        """Residuals, evidence of all effects but those that are known, what was not tested.
+
+        Process noise can take up what a model lacks, and a simulation with it explains less than it
+        could: structure is looked for in the residuals of a fit without it, too.
+        """
         residuals = self.residuals(fit, self.data.known, self.held_out)
         effects = [e for e in self.effects if not (e.once and e.name in known)]
-        found, skipped = look(
-            residuals, effects, seed=self.seed, workers=self.workers, progress=self.progress
-        )
+        options: dict[str, Any] = {
+            "seed": self.seed, "workers": self.workers, "progress": self.progress,
+        }  # fmt: skip
+        found, skipped = look(residuals, effects, **options)
+        if isinstance(fit.model, LinearDynamicGP) and fit.model.process_noise:
+            structural = [e for e in effects if e.added and e.score == "forecast"]
+            training = without(self.data.known, self.held_out)
+            plain = replace(fit.model, process_noise=False)
+            again = quick_fit(plain, training, poles_of(fit), self.seed, fit)
+            others = self.residuals(again, self.data.known, self.held_out)
+            found = merged(found, look(others, structural, **options)[0])
         return residuals, found, skipped
 
     def confirm(self, chosen: Any, current: Fit, number: int) -> Confirmed:
@@ -242,6 +256,11 @@ def _names(fit: Fit, record: Record, candidates: Sequence[str] | Record | None) 
                 "candidates", expected=f"extra channels {list(record.extra)}", got=f"{unknown}"
             )
     return sorted(set(names) - used_channels(fit.model))
+
+
+def _reported(found: Sequence[Found], level: float) -> list[Found]:
+    """What no block mends. Of the last tests: what a model lacks may look like feedback, too."""
+    return [f for f in found if not f.effect.added and f.q_value <= level]
 
 
 def _untried(
@@ -372,6 +391,7 @@ def _effect(found: Found, confirmed: Confirmed, extended: Fit) -> FoundEffect:
         q_value=found.q_value,
         gain=attempt.gain,
         gain_error=attempt.gain_error,
+        size=found.evidence.size,
         parameters=_weights(extended, own),
         block="; ".join(lines),
         curve=found.evidence.curve,
@@ -388,6 +408,7 @@ def _only_reported(found: Found) -> FoundEffect:
         q_value=found.q_value,
         gain=0.0,
         gain_error=0.0,
+        size=found.evidence.size,
         parameters={},
         block="",
         curve=found.evidence.curve,

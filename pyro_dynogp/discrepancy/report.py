@@ -50,12 +50,13 @@ class Attempt:
 
 @dataclass(frozen=True, eq=False)
 class FoundEffect:
-    """An effect that was added to the model.
+    """An effect that was added to the model, or one that is only reported (feedback).
 
     Attributes:
         name: of the effect. sentence: what it is, with its size, in the units of the record.
         p_value: of the test that named it. q_value: false discovery rate.
         gain, gain_error: elpd of held-out data after less before [nats].
+        size: root mean square of what it does to the output [output].
         parameters: posterior of what the block has learnt: mean and standard deviation by name.
         block: the model's block, in words. curve: the evidence.
         ties: names of effects that explain the data as well.
@@ -68,6 +69,7 @@ class FoundEffect:
     q_value: float
     gain: float
     gain_error: float
+    size: float
     parameters: Mapping[str, tuple[float, float]]
     block: str
     curve: Curve | None
@@ -80,7 +82,7 @@ class Report:
     """Result of `close_loop`.
 
     Attributes:
-        effects: accepted, in the order in which they were added.
+        effects: accepted, in the order in which they were added; then what is only reported.
         outcome: "effects added", "nothing missing", "structure left, cause unknown" or "effects
             added, structure left".
         before, after: scores on the sealed block C of the model given and of the extended one, both

@@ -71,9 +71,28 @@ def look(
         if not isinstance(several, str)
         for one in several
     ]
+    return rated(found), skipped
+
+
+def rated(found: Sequence[tuple[Effect, Evidence]]) -> list[Found]:
+    """With false discovery rates, most probable effects first."""
     q = false_discovery_rates(np.array([one.p_value for _, one in found]))
-    rated = [Found(effect, one, float(v)) for (effect, one), v in zip(found, q, strict=True)]
-    return sorted(rated, key=lambda f: (f.evidence.p_value, -f.evidence.gain)), skipped
+    both = [Found(effect, one, float(v)) for (effect, one), v in zip(found, q, strict=True)]
+    return sorted(both, key=lambda f: (f.evidence.p_value, -f.evidence.gain))
+
+
+def merged(first: Sequence[Found], second: Sequence[Found]) -> list[Found]:
+    """Evidence from two fits: of each effect on each channel the more probable one, paid for."""
+    names = {one.effect.name for one in second}
+    best: dict[tuple[str, str], tuple[Effect, Evidence]] = {}
+    for one in (*first, *second):
+        evidence = one.evidence
+        if one.effect.name in names:
+            evidence = replace(evidence, p_value=min(1.0, 2.0 * evidence.p_value))
+        key = one.effect.name, str(evidence.where.get("channel", ""))
+        if key not in best or evidence.p_value < best[key][1].p_value:
+            best[key] = one.effect, evidence
+    return rated(list(best.values()))
 
 
 def false_discovery_rates(p_values: np.ndarray) -> np.ndarray:

@@ -20,6 +20,7 @@ from tests.benchmarks import (
     electricity,
     example2,
     guides,
+    measured,
     planted,
     reference,
     selection,
@@ -41,6 +42,7 @@ PARTS = {
     "selection": selection.run,
     "brute_force": brute_force.run,
     "planted": planted.run,
+    "measured": measured.run,
 }
 
 

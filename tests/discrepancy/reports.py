@@ -65,7 +65,7 @@ def effect(**changes):
     options = {
         "name": "extra input",
         "sentence": "Channel 'ambient' acts on 'level', 3.5 s later, about 0.31 m (rms).",
-        "p_value": 2e-5, "q_value": 0.0004, "gain": 84.31, "gain_error": 12.7,
+        "p_value": 2e-5, "q_value": 0.0004, "gain": 84.31, "gain_error": 12.7, "size": 0.4,
         "parameters": {"gain of ambient [m/°C]": (0.0121, 0.0009), "time constant [s]": (4.2, 0.6)},
         "block": "ambient as an input of the dynamics", "curve": curve(),
         "ties": ("drift", "calendar"), "experiment": EXPERIMENT,
@@ -79,7 +79,7 @@ def delay(**changes):
     options = {
         "name": "dead time", "sentence": "'level' follows channel 'valve' 2.1 s later than the "
         "model says, about 0.12 m (rms).", "p_value": 0.0031, "q_value": 0.021, "gain": 21.0,
-        "gain_error": 6.1, "parameters": {}, "block": "valve delayed by 2.1 s",
+        "gain_error": 6.1, "size": 0.12, "parameters": {}, "block": "valve delayed by 2.1 s",
         "curve": curve(
             x=grid, y=gains, fitted=np.full(30, np.nan), x_label="additional delay [s]",
             y_label="gain [nats]",

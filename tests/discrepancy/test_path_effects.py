@@ -7,6 +7,7 @@ import pytest
 from scipy.signal import cont2discrete, lfilter
 
 from pyro_dynogp import signals
+from pyro_dynogp.discrepancy.delays import likely_delays
 from pyro_dynogp.discrepancy.path_effects import dead_time, extra_input, unmodelled_dynamics
 
 from .made import coloured, lag, null_record, residuals_of, within_chance
@@ -192,3 +193,15 @@ def test_too_short_a_record():
     r = dataclasses.replace(null_record(0), held_out=np.arange(400) >= 380)
     with pytest.raises(ValueError, match="at least 30 samples"):
         dead_time(r)
+
+
+@pytest.mark.parametrize("delay", [0, 7, 38])
+def test_regressions_find_the_delay_that_poles_hide(delay):
+    rng = np.random.default_rng(delay)
+    u = lfilter([1.0], [1.0, -0.8], rng.standard_normal((800, 2)), axis=0)
+    late = np.concatenate([np.zeros(delay), u[: len(u) - delay, 1]])
+    y = lfilter([0.0, 0.5], [1.0, -1.5, 0.8], late) + lfilter([0.0, 1.0], [1.0, -0.7], u[:, 0])
+    y = y + 0.05 * y.std() * rng.standard_normal(800)
+    y[100:110] = np.nan
+    assert abs(likely_delays(y, u, [1], 80)[0] - delay) <= 1
+    assert likely_delays(y[:60], u[:60], [1], 50) == []
