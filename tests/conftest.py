@@ -15,6 +15,11 @@ settings.register_profile("deterministic", derandomize=True, deadline=None)
 settings.load_profile("deterministic")
 
 
+def pytest_collection_modifyitems(items):
+    """Notebooks first: they take longest, and at the end one process would wait for another."""
+    items.sort(key=lambda item: "test_notebooks" not in item.nodeid)
+
+
 def simulate_record(modes, noise_sd, n=240, step=0.1, seed=0, **names):
     """Random steps as input through a known system."""
     rng = np.random.default_rng(seed)

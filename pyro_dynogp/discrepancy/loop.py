@@ -44,6 +44,8 @@ from pyro_dynogp.record import Record
 if TYPE_CHECKING:
     from pyro_dynogp.inference.result import Fit
 
+# Families of effects that go with inputs.
+OF_INPUTS = ("paths", "shapes")
 # Fresh starts of the last fits, of linear models and of cascades.
 LINEAR_STARTS, CASCADE_STARTS = 2, 4
 SCORES = ("rmse", "mae", "nrmse", "crps", "coverage_50", "coverage_95")
@@ -193,8 +195,8 @@ class _State:
     ) -> tuple[list[Residuals], list[Found], list[str]]:
         """Residuals, evidence of all effects but those that are known, what was not tested.
 
-        Process noise can take up what a model lacks, and a simulation with it explains less than it
-        could: structure is looked for in the residuals of a fit without it, too.
+        Process noise can take up what inputs do, and a simulation with it explains less than it
+        could: what goes with inputs is looked for in the residuals of a fit without it, too.
         """
         residuals = self.residuals(fit, self.data.known, self.held_out)
         effects = [e for e in self.effects if not (e.once and e.name in known)]
@@ -203,7 +205,7 @@ class _State:
         }  # fmt: skip
         found, skipped = look(residuals, effects, **options)
         if isinstance(fit.model, LinearDynamicGP) and fit.model.process_noise:
-            structural = [e for e in effects if e.added and e.score == "forecast"]
+            structural = [e for e in effects if e.family in OF_INPUTS and e.score == "forecast"]
             training = without(self.data.known, self.held_out)
             plain = replace(fit.model, process_noise=False)
             again = quick_fit(plain, training, poles_of(fit), self.seed, fit)
