@@ -66,7 +66,6 @@ def confirm(
     current: Fit,
     record: Record,
     held_out: np.ndarray,
-    poles: np.ndarray | None,
     *,
     number: int,
     seed: int,
@@ -78,7 +77,7 @@ def confirm(
 
     Args:
         candidates: from `candidates_of`. current: fit of the model that is extended, to what is not
-            held out. record: blocks A and B. held_out: (n,) True in B. poles: of the model.
+            held out. record: blocks A and B. held_out: (n,) True in B.
         number: of the round. seed: of refits. level: of the tests.
     """
     model = replace(current.model, scaling=None)
@@ -91,7 +90,7 @@ def confirm(
         where, score = kind
         known = current if found is None and where == "after" else None
         refine = None if found is None else found.effect.refine
-        return Trial(models, record, folds[where], poles, seed, score, refine, known, current)
+        return Trial(models, record, folds[where], current, seed, score, refine, known)
 
     def fitted(tasks: dict[Any, Trial], label: str) -> dict[Any, Tried]:
         done = parallel_map(

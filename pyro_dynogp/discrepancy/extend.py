@@ -66,6 +66,11 @@ def has_process_noise(model: Model) -> bool:
     return all(one.process_noise for one in model.layers if isinstance(one, Dynamic))
 
 
+def has_function(model: Model) -> bool:
+    """Whether there is a static layer."""
+    return isinstance(model, Cascade) and any(isinstance(one, Static) for one in model.layers)
+
+
 def as_cascade(model: Model) -> Cascade:
     """A linear model as a cascade of one dynamic layer; a cascade as it is."""
     if isinstance(model, Cascade):

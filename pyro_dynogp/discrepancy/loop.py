@@ -18,14 +18,13 @@ from pyro_dynogp.discrepancy.blocks import Blocks, blocks_of, shared
 from pyro_dynogp.discrepancy.confirm import Confirmed, confirm
 from pyro_dynogp.discrepancy.effects import CATALOGUE, Effect
 from pyro_dynogp.discrepancy.evidence import Residuals
-from pyro_dynogp.discrepancy.extend import Model, used_channels
+from pyro_dynogp.discrepancy.extend import Model, has_function, used_channels
 from pyro_dynogp.discrepancy.gate import structure_left
 from pyro_dynogp.discrepancy.noise_effects import data_faults
 from pyro_dynogp.discrepancy.report import Attempt, FoundEffect, Report
 from pyro_dynogp.discrepancy.residuals import residuals_of
 from pyro_dynogp.discrepancy.search import Found, candidates_of, look, merged
 from pyro_dynogp.discrepancy.trials import (
-    at_mode,
     one_step_density,
     poles_of,
     quick_fit,
@@ -34,7 +33,6 @@ from pyro_dynogp.discrepancy.trials import (
 from pyro_dynogp.inference.fit import fit as fit_model
 from pyro_dynogp.inference.result import Method
 from pyro_dynogp.models.cascade import Cascade
-from pyro_dynogp.models.layers import Static
 from pyro_dynogp.models.linear import LinearDynamicGP
 from pyro_dynogp.parallel import parallel_map
 from pyro_dynogp.prediction.clock import joined
@@ -100,7 +98,7 @@ def close_loop(
     names = _names(fit, data.known, candidates)
     poles = poles_of(fit)
     training = without(data.known, data.held_out)
-    first = quick_fit(fit.model, training, poles, seed) if data.refit else at_mode(fit)
+    first = quick_fit(fit.model, training, poles, seed) if data.refit else fit.at_mode()
     current = first
     clock.next("fit of block A")
     state = _State(data, names, seed, level, tries, effects, workers, progress)
@@ -215,7 +213,7 @@ class _State:
 
     def confirm(self, chosen: Any, current: Fit, number: int) -> Confirmed:
         return confirm(
-            chosen, current, self.data.known, self.held_out, poles_of(current), number=number,
+            chosen, current, self.data.known, self.held_out, number=number,
             seed=self.seed, level=self.level, workers=self.workers, progress=self.progress,
         )  # fmt: skip
 
@@ -231,9 +229,10 @@ class _State:
 
     def structure(self, residuals: Sequence[Residuals], found: Sequence[Found]) -> bool:
         """Whether anything is left: by the omnibus test, or by one of the others, all paid for."""
+        if min((f.q_value for f in found), default=1.0) < self.level:
+            return True
         omnibus = min(structure_left(one, seed=self.seed)[0] for one in residuals)
-        lowest = min((f.q_value for f in found), default=1.0)
-        return min(1.0, omnibus * len(residuals)) < self.level or lowest < self.level
+        return min(1.0, omnibus * len(residuals)) < self.level
 
 
 def _faults(residuals: Sequence[Residuals], record: Record) -> list[str]:
@@ -290,10 +289,7 @@ def _final(fits: Sequence[Fit], record: Record, workers: int | None, progress: b
 
     def one(given: Fit) -> Fit:
         model = replace(given.model, scaling=None)
-        functions = isinstance(model, Cascade) and any(
-            isinstance(layer, Static) for layer in model.layers
-        )
-        method: Method = "svi" if functions or given.method != "map" else "map"
+        method: Method = "svi" if has_function(model) or given.method != "map" else "map"
         restarts = CASCADE_STARTS if isinstance(model, Cascade) else LINEAR_STARTS
         return fit_model(
             model, record, method=method, start=given, restarts=restarts, seed=given.seed,

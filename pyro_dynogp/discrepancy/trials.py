@@ -5,16 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
 from scipy.special import logsumexp
 
 from pyro_dynogp.criticism.densities import pointwise_log_density
-from pyro_dynogp.discrepancy.extend import Model
+from pyro_dynogp.discrepancy.extend import Model, has_function
 from pyro_dynogp.inference.cascade_fit import starting_points
 from pyro_dynogp.inference.checkpoints import NOTHING_KEPT
+from pyro_dynogp.inference.fit import at_optimum
 from pyro_dynogp.inference.maximum import Optimum, maximise
 from pyro_dynogp.inference.result import Fit
 from pyro_dynogp.inference.starts import (
@@ -25,7 +25,6 @@ from pyro_dynogp.inference.starts import (
 )
 from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.collapsed import collapsed_of
-from pyro_dynogp.models.layers import Static
 from pyro_dynogp.models.linear import LinearDynamicGP
 from pyro_dynogp.prediction.beginning import beginning
 from pyro_dynogp.prediction.linear import prior_process
@@ -51,22 +50,20 @@ class Trial:
         record: without the block that nobody has seen.
         folds: (n,) True where a fold is scored; it is trained on the rest.
         refine: makes finer variants of the best one, given how many times it did so; none for none.
-        poles: (P,) of the model that is extended [1/time unit], to start from; none for a cascade.
+        base: fit of the model that is extended, to start from.
         seed: of fresh starts.
         score: what densities are of, see `held_out_density`.
         fit: of a single model to the first fold's training data, where there is one already.
-        base: fit of the model that is extended, to start from; None for fresh starts alone.
     """
 
     models: tuple[Model, ...]
     record: Record
     folds: tuple[np.ndarray, ...]
-    poles: np.ndarray | None
+    base: Fit
     seed: int
     score: Score = "one step"
     refine: Callable[[Model, int], Sequence[Model]] | None = None
     fit: Fit | None = None
-    base: Fit | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,15 +91,14 @@ def run(trial: Trial) -> Tried:
     begin = time.perf_counter()
     training = without(trial.record, trial.folds[0])
     several = len(trial.models) > 1
+    poles = poles_of(trial.base)
     problems: list[str] = []
     fitted: list[Fit] = []
 
     def look(models: Sequence[Model]) -> None:
         for model in models:
             try:
-                found = quick_fit(
-                    model, training, trial.poles, trial.seed, trial.base, short=several
-                )
+                found = quick_fit(model, training, poles, trial.seed, trial.base, short=several)
                 fitted.append(found)
             except ValueError as error:  # for instance a channel that is constant there
                 problems.append(str(error))
@@ -128,11 +124,11 @@ def run(trial: Trial) -> Tried:
         for index, fold in enumerate(trial.folds):
             if index == 0:
                 if several:  # so far only to rank it
-                    first = quick_fit(model, training, trial.poles, trial.seed, trial.base)
+                    first = quick_fit(model, training, poles, trial.seed, trial.base)
                 found = first
             else:
                 rest = without(trial.record, fold)
-                found = quick_fit(model, rest, trial.poles, trial.seed, trial.base)
+                found = quick_fit(model, rest, poles, trial.seed, trial.base)
             parts.append(held_out_density(found, trial.record, fold, trial.score))
             if trial.score == "one step":
                 beside.append(held_out_density(found, trial.record, fold, "forecast"))
@@ -179,24 +175,7 @@ def quick_fit(
     else:
         steps = LINEAR_STEPS // 3 if short else LINEAR_STEPS
         optima = _linear(scaled, records, poles, seed, steps, base)
-    best = optima[0]
-    return Fit(
-        model=scaled,
-        method="map",
-        draws=MappingProxyType({k: v.unsqueeze(0) for k, v in best.values.items()}),
-        mode=MappingProxyType(dict(best.values)),
-        history=best.history,
-        start_energies=np.array([one.energy for one in optima]),
-        diagnostics=MappingProxyType({"iterations": float(len(best.history))}),
-        seed=seed,
-        records=records,
-    )
-
-
-def at_mode(fit: Fit) -> Fit:
-    """The fit with its posterior mode for draws, as refits have it."""
-    draws = MappingProxyType({k: v.unsqueeze(0) for k, v in fit.mode.items()})
-    return fit if fit.method == "map" else replace(fit, method="map", draws=draws)
+    return at_optimum(scaled, optima, seed, records)
 
 
 def _linear(
@@ -231,8 +210,7 @@ def _cascade(
 
     Without a function a cascade starts at its optimum but for the noise: one start is enough.
     """
-    functions = any(isinstance(layer, Static) for layer in model.layers)
-    count, steps = CASCADE_STARTS if functions else 1, CASCADE_STEPS
+    count, steps = CASCADE_STARTS if has_function(model) else 1, CASCADE_STEPS
     target = model.collapsed
     before = None if base is None else base.model
     warm = isinstance(before, Cascade) and len(before.layers) == len(model.layers)

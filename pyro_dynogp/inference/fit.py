@@ -188,12 +188,7 @@ def fit(
     common = _common(model, method, optima, seed, records)
     best = optima[0]
     if method == "map":
-        return Fit(
-            draws=MappingProxyType({k: v.unsqueeze(0) for k, v in best.values.items()}),
-            history=best.history,
-            diagnostics=MappingProxyType({"iterations": float(len(best.history))}),
-            **common,
-        )
+        return at_optimum(model, optima, seed, records)
     if method == "svi":
         chosen = hyperparameters or ("map" if cascade else "multivariate normal")
         found = posterior_of(
@@ -263,6 +258,17 @@ def _identity(guide: GuideChoice) -> object:
         constants = tuple(c for c in code.co_consts if isinstance(c, int | float | str))
         body = (code.co_code, code.co_names, constants)
     return (named.__module__, named.__qualname__, body)
+
+
+def at_optimum(model: Any, optima: Sequence[Optimum], seed: int, records: Sequence[Record]) -> Fit:
+    """The fit that the best of several optima is: a posterior mode."""
+    best = optima[0]
+    return Fit(
+        draws=MappingProxyType({k: v.unsqueeze(0) for k, v in best.values.items()}),
+        history=best.history,
+        diagnostics=MappingProxyType({"iterations": float(len(best.history))}),
+        **_common(model, "map", optima, seed, records),
+    )
 
 
 def _common(

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -143,6 +144,13 @@ class Fit:
     def elbo(self) -> np.ndarray:
         """Evidence lower bound after each step of SVI; for "map" log p(y, values) [nats]."""
         return self.history if self.method == "svi" else -self.history
+
+    def at_mode(self) -> Fit:
+        """The same fit with its posterior mode in place of its draws."""
+        if self.method == "map":
+            return self
+        draws = MappingProxyType({name: value.unsqueeze(0) for name, value in self.mode.items()})
+        return replace(self, method="map", draws=draws)
 
     def layers(self, record: Record) -> Mapping[str, LayerTrajectory]:
         """Posterior trajectories of all layers along a record, given its inputs and outputs.

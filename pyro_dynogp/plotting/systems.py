@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -156,10 +155,7 @@ def pole_map(fit: Fit) -> Figure:
     unit = fit.scaling.time_unit
     draws = _unbatched(fit.modes.poles, fit).ravel()
     # Constraining a copy to the mode gives the poles there, in the units of the record.
-    at_mode = dataclasses.replace(
-        fit, method="map", draws={site: value[None] for site, value in fit.mode.items()}
-    )
-    best = np.asarray(at_mode.modes.poles)
+    best = np.asarray(fit.at_mode().modes.poles)
     figure, axes = style.panels(1, width=7.6, height=6.2)
     panel = axes[0, 0]
     sampled = fit.method != "map"

@@ -118,7 +118,7 @@ def test_the_fit_of_the_winner_is_handed_on() -> None:
     model = replace(fit.model, scaling=None)
     variants = tuple(found.effect.extend(model, found.evidence, record))
     done = confirm(
-        [(found, variants)], fit, record[:360], held_out, None,
+        [(found, variants)], fit, record[:360], held_out,
         number=1, seed=0, level=0.05, workers=1,
     )  # fmt: skip
     assert done.winner is found
