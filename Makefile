@@ -16,7 +16,7 @@ test: $(VENV)/installed
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -n $(WORKERS)
 
-benchmark: $(VENV)/installed
+benchmark: $(VENV)/peers
 	$(BIN)/python -m tests.benchmarks
 
 # torch is named first and pinned, so that no other package pulls in a different build of it.
@@ -24,6 +24,10 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt torch
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]'
+	touch $@
+
+$(VENV)/peers: $(VENV)/installed tests/benchmarks/peers.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r tests/benchmarks/peers.txt
 	touch $@
 
 clean:

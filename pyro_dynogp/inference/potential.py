@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -50,6 +51,21 @@ def log_prob_by_draw(trace: Any, count: int) -> Tensor:
         several = log_prob.dim() > 0 and log_prob.shape[0] == count
         total = total + (log_prob.reshape(count, -1).sum(1) if several else log_prob.sum())
     return total
+
+
+@contextlib.contextmanager
+def denormals_flushed() -> Iterator[None]:
+    """Inside, numbers below 1e-308 are zero; outside nothing has changed.
+
+    What an unknown first state leaves decays through that range along a record, and processors are
+    many times slower there.
+    """
+    before = not bool(torch.tensor(1e-310, dtype=torch.float64) * 1.0)
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(before)
 
 
 class Potential:
@@ -126,7 +142,7 @@ class Potential:
         """
         x = torch.tensor(z, dtype=torch.float64, requires_grad=True)
         try:
-            with pyro.validation_enabled(False):
+            with pyro.validation_enabled(False), denormals_flushed():
                 energy = self.energy(x, jacobian=jacobian)
                 (gradient,) = torch.autograd.grad(energy, x)
         except (NotPositiveDefiniteError, torch.linalg.LinAlgError, ValueError):

@@ -175,6 +175,11 @@ class Modes:
         return bool(self.__dict__["_several"])
 
     @property
+    def has_process_noise(self) -> bool:
+        """Whether any Brownian motion drives the states (its gain may still be zero)."""
+        return self.L.shape[-1] > 0
+
+    @property
     def batch_shape(self) -> torch.Size:
         """The common batch shape *b."""
         return cast(torch.Size, self.__dict__["_batch"])

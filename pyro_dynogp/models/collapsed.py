@@ -28,6 +28,7 @@ from pyro_dynogp.lti.fused import propagators
 from pyro_dynogp.lti.grid import TimeGrid, time_grid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import mean_response
+from pyro_dynogp.models import known
 from pyro_dynogp.models.cascade import (
     CascadeSystem,
     DynamicSystem,
@@ -445,7 +446,8 @@ class ObservedCascade(TorchDistribution):
 
     The log-density is that of a Gaussian assumed-density filter over the joint state of all dynamic
     layers: exact where the static layers are linear and the noise is Gaussian, else as good as
-    Gaussian moments are. Event shape (n,), or (n, n_y). NaN marks a missing sample.
+    Gaussian moments are. Where only the last layer's trajectory is unknown no filter is needed: see
+    `pyro_dynogp.models.known`. Event shape (n,), or (n, n_y). NaN marks a missing sample.
 
     Args:
         system: layers given their parameters. time: (n,) or a `TimeGrid`. inputs: (n, n_u) scaled.
@@ -488,11 +490,14 @@ class ObservedCascade(TorchDistribution):
         """Log-density (*s, *batch) of outputs (*s, *batch, *event) in the record's units [nats]."""
         y = value if self._several else value.unsqueeze(-1)
         scaled = (y - self.shift) / self.scale
-        problem = assemble(self.system, self.grid, self.inputs).with_outputs(scaled)
+        if known.has_exact_density(self.system):
+            found = known.log_density(self.system, self.grid, self.inputs, scaled)
+        else:
+            found = log_density(assemble(self.system, self.grid, self.inputs).with_outputs(scaled))
         there = (~torch.isnan(y)).to(torch.float64)
         jacobian = (there * self.scale.log()).sum((-2, -1))
         batch = broadcast(y.shape[:-2], self.batch_shape)
-        return (log_density(problem) - jacobian).expand(batch)
+        return (found - jacobian).expand(batch)
 
     def innovations(self, value: Tensor) -> tuple[np.ndarray, np.ndarray]:
         """One-step prediction errors and their variances (*batch, K) of scaled outputs.

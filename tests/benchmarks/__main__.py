@@ -27,6 +27,7 @@ from tests.benchmarks import (
     speed,
     wiener,
 )
+from tests.benchmarks.paper import run as paper
 
 PARTS = {
     "speed": speed.run,
@@ -43,6 +44,7 @@ PARTS = {
     "brute_force": brute_force.run,
     "planted": planted.run,
     "measured": measured.run,
+    "paper": paper.run,
 }
 
 

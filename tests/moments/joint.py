@@ -89,7 +89,8 @@ def linear_function(slope, constant, reach=80.0):
 def linear_cascade(inputs, layers, time, u, *, seed=0, noise="shared", known_start=()):
     """A cascade at random whose static layers are linear, and its joint Gaussian.
 
-    Layers named in `known_start` begin in a known state, all others in an uncertain one.
+    Layers named in `known_start` begin in a known state, all others in an uncertain one; those
+    without process noise have none.
     """
     rng = np.random.default_rng([seed, 3])
     joint = Joint(time, u)
@@ -104,6 +105,7 @@ def linear_cascade(inputs, layers, time, u, *, seed=0, noise="shared", known_sta
                 inputs=one.channels,
                 outputs=width if width > 1 else None,
                 noise=noise,
+                brownian=2 if one.layer.process_noise else 0,
             )
             past = oracles.random_covariance(2 * one.layer.pairs, seed + place)
             z0 = rng.standard_normal(2 * one.layer.pairs) if one.name in known_start else None

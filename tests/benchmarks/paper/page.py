@@ -1,0 +1,180 @@
+"""Tables and figures of the comparison, from the rows that jobs have left."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tests.benchmarks.paper.experiments import EXPERIMENTS, Experiment
+from tests.benchmarks.paper.figures import experiment_figure, study_figure
+
+Row = Mapping[str, Any]
+# Column -> score, and whether it carries the output's unit.
+COLUMNS = {"RMSE": "rmse", "MAE": "mae", "CRPS": "crps", "coverage 95 %": "coverage_95",
+           "log density": "log_density"}  # fmt: skip
+STUDY_COLUMNS = {"RMSE / floor": "rmse_over_floor", "clean RMSE / floor": "clean_over_floor",
+                 "CRPS / floor": "crps_over_floor", "coverage 95 %": "coverage_95",
+                 "MAE, first 150": "first_over_floor",
+                 "MAE, after": "after_over_floor"}  # fmt: skip
+PUBLISHED = ("dynoGP, published", "dynoNet, published", "GP-NARX, published")
+
+
+def page(rows: Sequence[Row], folder: Path) -> str:
+    """One section for each experiment that has rows; figures are written to the folder."""
+    parts = [
+        "Every method gets the same wall time for learning on the same machine, an experiment's "
+        "budget; it may stop before. Tests are free runs: no test output is seen. A cell is the "
+        "median over seeds, with the range in brackets; the CRPS of a point prediction is its MAE."
+    ]
+    for key, experiment in EXPERIMENTS.items():
+        own = [row for row in rows if row["experiment"] == key]
+        if own:
+            parts += _section(key, experiment, own, folder)
+    return "\n\n".join(parts)
+
+
+def _section(key: str, experiment: Experiment, rows: Sequence[Row], folder: Path) -> list[str]:
+    unit = f" Unit: {experiment.unit}." if experiment.unit else ""
+    parts = [
+        f"### {experiment.name}",
+        f"{experiment.note}{unit} Budget {experiment.seconds / 60:.3g} minutes, "
+        f"{len(experiment.seeds)} seed(s).".strip(),
+    ]
+    done = [row for row in rows if "failed" not in row]
+    names = list(dict.fromkeys(name for row in done for name in row["scores"]))
+    for name in names:
+        if len(names) > 1:
+            parts.append(f"Test record: {name}.")
+        parts.append(_table(experiment, done, name, published=name == names[0]))
+    parts.append(_costs(done))
+    parts += _targets(experiment, done)
+    parts += _notes(rows)
+    if done:
+        draw = study_figure if experiment.simulated else experiment_figure
+        draw(experiment, done, folder / key)
+        parts.append(f"![{experiment.name}](paper/{key}/figure.png)")
+    return parts
+
+
+def values_of(rows: Sequence[Row], method: str, test: str, score: str) -> np.ndarray:
+    """A score of one method over its seeds."""
+    return np.array([_score(row["scores"][test], score) for row in rows if row["method"] == method])
+
+
+def _score(found: Mapping[str, float], score: str) -> float:
+    """A score; in units of the noise floor where its name says so."""
+    floor = found.get("floor", math.nan)
+    derived = {
+        "clean_over_floor": ("rmse_clean", floor),
+        "first_over_floor": ("mae_first_150", floor * math.sqrt(2.0 / math.pi)),
+        "after_over_floor": ("mae_after", floor * math.sqrt(2.0 / math.pi)),
+        "crps_over_floor": ("crps", floor / math.sqrt(math.pi)),
+    }
+    if score in derived:
+        name, scale = derived[score]
+        return found.get(name, math.nan) / scale
+    return found.get(score, math.nan)
+
+
+def _methods(rows: Sequence[Row]) -> list[str]:
+    return list(dict.fromkeys(row["method"] for row in rows))
+
+
+def _table(experiment: Experiment, rows: Sequence[Row], test: str, published: bool) -> str:
+    columns = STUDY_COLUMNS if experiment.simulated else COLUMNS
+    lines = [["method", *columns]]
+    for method in _methods(rows):
+        cells = [spread(values_of(rows, method, test, score)) for score in columns.values()]
+        lines.append([method, *cells])
+    if published and experiment.paper:
+        for place, name in enumerate(PUBLISHED):
+            cells = [
+                number(experiment.paper[score][place]) if score in experiment.paper else ""
+                for score in columns.values()
+            ]
+            lines.append([name, *cells])
+    return _markdown(lines)
+
+
+def _costs(rows: Sequence[Row]) -> str:
+    lines = [["method", "learning [s]", "iterations", "one pass over the record [s]",
+              "per 1000 samples [s]", "peak memory [GB]"]]  # fmt: skip
+    for method in _methods(rows):
+        own = [row for row in rows if row["method"] == method]
+        passes = np.array([row["step_seconds"] for row in own], dtype=float)
+        length = np.array([_length(row["experiment"]) for row in own], dtype=float)
+        lines.append([
+            method,
+            spread(np.array([row["seconds"] for row in own])),
+            spread(np.array([row["steps"] for row in own], dtype=float)),
+            spread(passes),
+            spread(1000.0 * passes / length),
+            spread(np.array([row["memory_gb"] for row in own])),
+        ])  # fmt: skip
+    return _markdown(lines)
+
+
+LENGTHS: dict[str, int] = {}
+
+
+def _length(experiment: str) -> int:
+    if experiment not in LENGTHS:
+        one = EXPERIMENTS[experiment]
+        LENGTHS[experiment] = len(one.load(one.seeds[0])[0])
+    return LENGTHS[experiment]
+
+
+def _targets(experiment: Experiment, rows: Sequence[Row]) -> list[str]:
+    """What the project set out to reach, and what it came to, in a line each."""
+    own = [row for row in rows if row["method"] == "pyro_dynogp"]
+    if not own or not experiment.targets:
+        return []
+    tests = list(own[0]["scores"])
+    lines = []
+    for target, limit in experiment.targets.items():
+        score, _, test = target.partition(" ")
+        found = float(np.median(values_of(own, "pyro_dynogp", test or tests[0], score)))
+        verdict = "reached" if found <= limit else f"not reached, {found / limit - 1.0:.0%} above"
+        where = f" ({test})" if test else ""
+        lines.append(
+            f"- {score.upper()}{where}: {number(found)}, target {number(limit)}: {verdict}."
+        )
+    return ["Targets, from default settings:", "\n".join(lines)]
+
+
+def _notes(rows: Sequence[Row]) -> list[str]:
+    """Notes of methods, and failures, each once."""
+    found: dict[str, None] = {}
+    for row in rows:
+        if row.get("note"):
+            found[f"- {row['method']}: {row['note']}"] = None
+        if "failed" in row:
+            found[f"- {row['method']}, seed {row['seed']}: failed, {row['failed']}"] = None
+    return ["\n".join(found)] if found else []
+
+
+def number(value: float) -> str:
+    """Three significant digits; nothing for what is not there."""
+    if not math.isfinite(value):
+        return ""
+    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+
+
+def spread(values: np.ndarray) -> str:
+    """Median, and the range where there are several; nothing where there are none."""
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return ""
+    middle = number(float(np.median(values)))
+    if len(values) == 1:
+        return middle
+    return f"{middle} ({number(float(values.min()))} to {number(float(values.max()))})"
+
+
+def _markdown(lines: Sequence[Sequence[str]]) -> str:
+    head, *body = lines
+    return "\n".join("| " + " | ".join(line) + " |" for line in [head, ["---"] * len(head), *body])

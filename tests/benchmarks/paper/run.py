@@ -1,0 +1,88 @@
+"""Run all methods on all experiments, what is missing of it, and write the page."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from tests.benchmarks.paper.experiments import EXPERIMENTS
+from tests.benchmarks.paper.job import METHODS
+from tests.benchmarks.paper.page import page
+
+# A method is given this many times its budget before it is stopped; it should stop by itself.
+GRACE = 4.0
+
+
+def jobs(
+    experiments: Iterable[str] | None = None, methods: Iterable[str] | None = None
+) -> list[tuple[str, str, int]]:
+    """(experiment, method, seed), all seeds of one method together."""
+    return [
+        (experiment, method, seed)
+        for experiment in (experiments or EXPERIMENTS)
+        for method in (methods or METHODS)
+        for seed in EXPERIMENTS[experiment].seeds
+        if (experiment, method) not in LEFT_OUT
+    ]
+
+
+# The second study is for the methods that its criteria name; stacking is for short records.
+LEFT_OUT = {
+    *(("wiener_own", m) for m in METHODS if m not in ("pyro_dynogp", "dynoNet", "GP-NARX")),
+    *((e, "pyro_dynogp, stacked") for e in EXPERIMENTS if not e.startswith("drives")),
+}
+
+
+def run(
+    folder: Path,
+    experiments: Sequence[str] | None = None,
+    methods: Sequence[str] | None = None,
+) -> str:
+    """Do what is missing, one job at a time on the whole machine; tables and figures of all.
+
+    Args:
+        folder: finished jobs are files in ``paper/``; delete those that should be run again.
+        experiments, methods: names, all by default.
+    """
+    base = folder / "paper"
+    wanted = jobs(experiments, methods)
+    missing = [job for job in wanted if not file_of(base, job).exists()]
+    bar = tqdm(missing, desc="paper", disable=not missing)
+    for job in bar:
+        bar.set_postfix_str(f"{job[1]}, {job[0]}, seed {job[2]}")
+        _one(base, job)
+    rows = [json.loads(file_of(base, job).read_text()) for job in jobs()
+            if file_of(base, job).exists()]  # fmt: skip
+    return page(rows, base)
+
+
+def file_of(base: Path, job: tuple[str, str, int]) -> Path:
+    """Where the result of a job is kept."""
+    experiment, method, seed = job
+    return base / experiment / method.replace(", ", "-").replace(" ", "-") / f"{seed}.json"
+
+
+def _one(base: Path, job: tuple[str, str, int]) -> None:
+    experiment, method, seed = job
+    file = file_of(base, job)
+    command = [sys.executable, "-m", "tests.benchmarks.paper.job", experiment, method, str(seed)]
+    limit = GRACE * EXPERIMENTS[experiment].seconds + 600.0
+    problem: str | None = None
+    try:
+        done = subprocess.run(
+            [*command, str(file)], capture_output=True, text=True, timeout=limit, check=False
+        )
+        if done.returncode:
+            problem = done.stderr.strip().splitlines()[-1] if done.stderr.strip() else "killed"
+    except subprocess.TimeoutExpired:
+        problem = f"stopped after {limit:.0f} s"
+    if problem is not None:
+        failed: dict[str, Any] = {"experiment": experiment, "method": method, "seed": seed}
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps({**failed, "failed": problem}, indent=1))
