@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from pyro_dynogp.inference.cascade_starts import (
@@ -16,7 +17,7 @@ from pyro_dynogp.inference.checkpoints import Checkpoints
 from pyro_dynogp.inference.maximum import Optimizer, Optimum, maximise
 from pyro_dynogp.inference.starts import grown, starting_values
 from pyro_dynogp.models.cascade import Cascade
-from pyro_dynogp.models.layers import Dynamic
+from pyro_dynogp.models.layers import Dynamic, Static
 from pyro_dynogp.parallel import seeded
 from pyro_dynogp.record import Record
 
@@ -67,6 +68,25 @@ def starting_points(
         ]
 
 
+def without_process_noise(model: Cascade) -> Cascade:
+    """The model with deterministic dynamics; the same one where no static layer sees noise.
+
+    Layers that nothing else drives keep their process noise.
+    """
+    static = [place for place, one in enumerate(model.layers) if isinstance(one, Static)]
+    last = static[-1] if static else 0
+    seen = any(isinstance(one, Dynamic) and one.process_noise for one in model.layers[:last])
+    if not seen:
+        return model
+    layers = tuple(
+        replace(layer, process_noise=False, name=one.name)
+        if isinstance(layer, Dynamic) and one.channels
+        else layer
+        for one, layer in zip(model.wires, model.layers, strict=True)
+    )
+    return replace(model, layers=layers)
+
+
 def _one_output(records: Sequence[Record]) -> tuple[Record, ...]:
     return tuple(record.select(outputs=[record.output_names[0]]) for record in records)
 
@@ -83,11 +103,33 @@ def best_optima(
     checkpoints: Checkpoints,
     learnt: Values | None = None,
 ) -> list[Optimum]:
-    """Optima of the collapsed model from all starts, and from what is learnt, best first."""
-    starts = starting_points(model, records, restarts, steps, seed, workers, progress, checkpoints)
+    """Optima of the collapsed model from all starts, and from what is learnt, best first.
+
+    Where static layers see process noise every start goes two ways, which count as two restarts:
+    as it is, and after some steps without any process noise. Such noise can explain all that
+    dynamics and functions should, from a poor start to a high density and poor forecasts.
+    """
+    argument = records[0] if len(records) == 1 else tuple(records)
+    quiet = without_process_noise(model)
+    count = restarts if quiet == model else (restarts + 1) // 2
+    starts = starting_points(model, records, count, steps, seed, workers, progress, checkpoints)
+    if restarts > count:
+        deterministic = maximise(
+            quiet,
+            argument,
+            starts[: restarts - count],
+            optimizer=optimizer,
+            steps=max(1, steps // 5),
+            seed=seed,
+            workers=workers,
+            progress=progress,
+            checkpoints=checkpoints,
+            key="without-process-noise",
+            kept=1.0,
+        )
+        starts = [*starts, *(grown(one.values, starts[0]) for one in deterministic)]
     if learnt is not None:
         starts = [grown(learnt, starts[0]), *starts]
-    argument = records[0] if len(records) == 1 else tuple(records)
     return maximise(
         model,
         argument,

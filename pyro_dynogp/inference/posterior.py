@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp._errors import invalid
-from pyro_dynogp.inference.checkpoints import Checkpoints
+from pyro_dynogp.inference.checkpoints import Checkpoints, Piece
 from pyro_dynogp.inference.guides import GaussianGuide, MixtureGuide
 from pyro_dynogp.inference.maximum import Optimum
+from pyro_dynogp.inference.potential import Potential
 from pyro_dynogp.inference.variational import VariationalPosterior, variational
 from pyro_dynogp.parallel import parallel_map
 
@@ -23,6 +24,11 @@ Hyperparameters = Literal["map", "normal", "multivariate normal"]
 
 # Optima that a posterior can consist of.
 MOST_OPTIMA = 4
+# Least weight of one that counts.
+LEAST_WEIGHT = 0.05
+# Largest standard deviation of a direction in the evidence of an optimum (unconstrained units):
+# about twice that of the priors.
+WIDEST = 3.0
 
 
 @dataclass(frozen=True)
@@ -55,6 +61,24 @@ def _around(task: _Task) -> VariationalPosterior:
     return variational(conditioned, (task.argument,), task.free, **task.options)
 
 
+@dataclass(frozen=True)
+class _Place:
+    target: Any
+    argument: Any
+    values: dict[str, Tensor]
+    checkpoints: Checkpoints
+    key: str
+
+
+def _evidence(task: _Place) -> float:
+    def find() -> Piece:
+        potential = Potential(task.target, (task.argument,), task.values)
+        found = potential.log_evidence(task.values, widest=WIDEST)
+        return {"evidence": torch.tensor(found, dtype=torch.float64)}
+
+    return float(task.checkpoints.piece(task.key, find)["evidence"])
+
+
 def posterior_of(
     target: Any,
     argument: Any,
@@ -74,8 +98,9 @@ def posterior_of(
     With "map" inducing values and first states have multivariate normals and everything else stays
     at the optimum, at up to `MOST_OPTIMA` of them: such a posterior has many modes, and no normal
     spans two. Log densities of draws from a d-dimensional posterior spread by sqrt(d/2) nats, so an
-    optimum's height says no more than that about the mass around it. The weights of the optima
-    are therefore exp(ELBO / sqrt(d/2)), not exp(ELBO), which would keep one whatever the rest is.
+    optimum's evidence, found by Laplace's approximation for all sites, says hardly more than that
+    about the mass around it. The weights of the optima are therefore exp(evidence / sqrt(d/2)), not
+    exp(evidence), which would keep one whatever the rest is.
 
     Raises:
         ValueError: on "map" for a model without inducing values and first states.
@@ -94,12 +119,11 @@ def posterior_of(
             target, (argument,), dict(best), independent=independent, progress=progress, **options
         )
         return Posterior(found.guide, best, found.elbo, 1)
-    scale = spread(optima[0].values)
-    leading = [o for o in optima[:MOST_OPTIMA] if o.energy - optima[0].energy < 5.0 * scale]
+    leading, weights = _weighted(target, argument, optima, workers, checkpoints, progress)
     tasks = []
-    for index, optimum in enumerate(leading):
-        free = {k: v for k, v in optimum.values.items() if _is_free(k)}
-        fixed = {k: v for k, v in optimum.values.items() if k not in free}
+    for index, values in enumerate(leading):
+        free = {k: v for k, v in values.items() if _is_free(k)}
+        fixed = {k: v for k, v in values.items() if k not in free}
         if not free:
             raise invalid(
                 "hyperparameters",
@@ -116,15 +140,39 @@ def posterior_of(
         description="posterior",
         news=lambda found: f"elbo {max(level(one) for one in found):.2f}",
     )
-    order = sorted(range(len(tasks)), key=lambda index: -level(found_all[index]))
-    levels = torch.tensor([level(found_all[index]) for index in order], dtype=torch.float64)
     guide = MixtureGuide.of(
-        torch.softmax(levels / scale, 0),
-        [tasks[index].fixed for index in order],
-        [found_all[index].guide for index in order],
+        weights, [task.fixed for task in tasks], [found.guide for found in found_all]
     )
-    first = order[0]
-    return Posterior(guide, leading[first].values, found_all[first].elbo, len(order))
+    return Posterior(guide, leading[0], found_all[0].elbo, len(tasks))
+
+
+def _weighted(
+    target: Any,
+    argument: Any,
+    optima: Sequence[Optimum],
+    workers: int | None,
+    checkpoints: Checkpoints,
+    progress: bool,
+) -> tuple[list[dict[str, Tensor]], Tensor]:
+    """Values at the optima that carry weight, the weightiest first, and their weights."""
+    leading = [one.values for one in optima[:MOST_OPTIMA]]
+    if len(leading) == 1:
+        return leading, torch.ones(1, dtype=torch.float64)
+    evidences = parallel_map(
+        _evidence,
+        [
+            _Place(target, argument, values, checkpoints, f"evidence-{index}")
+            for index, values in enumerate(leading)
+        ],
+        workers=workers,
+        progress=progress,
+        description="evidence",
+        news=lambda found: f"log evidence {max(found):.2f}",
+    )
+    levels = torch.tensor(evidences, dtype=torch.float64)
+    weights, order = torch.softmax(levels / spread(leading[0]), 0).sort(descending=True)
+    heavy = weights >= LEAST_WEIGHT
+    return [leading[index] for index in order[heavy]], weights[heavy] / weights[heavy].sum()
 
 
 def spread(values: Mapping[str, Tensor]) -> float:

@@ -257,7 +257,8 @@ def _forward(
     on = Switches.all_on(system, process_noise, several_channels=not fit.collapsed)
 
     def at(switches: Switches) -> Drawn:
-        return draw_layers(system, grid, inputs, start, random, switches)
+        numbers = random if switches.any else random.first
+        return draw_layers(system, grid, inputs, start, numbers, switches)
 
     full = at(on)
     mean = shift + scale * _flat(full.mean)

@@ -70,6 +70,19 @@ class Randomness:
                 residual[one.name] = torch.randn(*shape, *event, dtype=torch.float64)
         return cls(torch.randn(*shape, states, dtype=torch.float64), innovations, residual)
 
+    @property
+    def first(self) -> Randomness:
+        """The first numbers of each posterior draw: enough where none of them is used."""
+
+        def cut(x: Tensor) -> Tensor:
+            return x[:1]
+
+        return Randomness(
+            cut(self.state),
+            {name: cut(x) for name, x in self.innovations.items()},
+            {name: cut(x) for name, x in self.residual.items()},
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Switches:
@@ -88,6 +101,11 @@ class Switches:
     process_noise: frozenset[str]
     functions: bool
     several_channels: bool = False
+
+    @property
+    def any(self) -> bool:
+        """Whether any cause acts: else equal parameters give equal draws."""
+        return self.initial_state or bool(self.process_noise) or self.functions
 
     @classmethod
     def all_on(
@@ -182,9 +200,10 @@ def _static(
     if function.channels > 1:
 
         def at(part: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            mean, variance = function.moments(part)
             if not (switches.functions and switches.several_channels):
-                return mean, mean, torch.zeros_like(variance)
+                mean = function.mean(part)
+                return mean, mean, torch.zeros_like(mean)
+            mean, variance = function.moments(part)
             return function.path(part, residual, support), mean, variance
 
         # Stretch by stretch: kernel matrices of all points at once would not fit.

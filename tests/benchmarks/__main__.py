@@ -27,6 +27,7 @@ from tests.benchmarks import (
     speed,
     wiener,
 )
+from tests.benchmarks.paper import growth
 from tests.benchmarks.paper import run as paper
 
 PARTS = {
@@ -45,6 +46,7 @@ PARTS = {
     "planted": planted.run,
     "measured": measured.run,
     "paper": paper.run,
+    "growth": growth.run,
 }
 
 

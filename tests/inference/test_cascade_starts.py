@@ -3,7 +3,11 @@
 import torch
 
 import pyro_dynogp as dgp
+from pyro_dynogp.inference import cascade_fit
+from pyro_dynogp.inference.cascade_fit import without_process_noise
 from pyro_dynogp.inference.cascade_starts import plans
+from pyro_dynogp.inference.maximum import maximise
+from pyro_dynogp.models.layers import Dynamic, Static
 from tests.inference.cascades import wiener
 
 OPTIMA = [{"optimum": torch.tensor(float(k))} for k in range(4)]
@@ -38,3 +42,42 @@ class TestPlans:
     def test_seeds_differ(self):
         seeds = [plan.seed for plan in plans(wiener(), {"g": OPTIMA}, 5, seed=3)]
         assert len(set(seeds)) == 5
+
+
+def test_without_process_noise():
+    quiet = without_process_noise(dgp.WienerHammerstein(1, pairs=2))
+    assert [one.process_noise for one in quiet.layers if isinstance(one, Dynamic)] == [False] * 2
+    assert [one.name for one in quiet.wires] == ["g1", "f", "g2"]
+    for model in (
+        dgp.Hammerstein(1, pairs=2),  # no static layer sees noise
+        dgp.Wiener(1, pairs=2, process_noise=False),
+        dgp.WienerHammerstein(1, pairs=2, process_noise=(False, True)),
+        dgp.Cascade(1, (Dynamic(pairs=2),)),
+    ):
+        assert without_process_noise(model) == model
+    # What nothing else drives keeps its noise.
+    layers = (Dynamic(pairs=1), Static(inducing=4))
+    alone = dgp.Cascade(0, layers)
+    assert without_process_noise(alone).layers[0].process_noise
+
+
+def test_starts_go_two_ways(monkeypatch, bent):
+    """Half of them after steps of the model without process noise, from its optima."""
+    calls = []
+
+    def recorded(model, records, starts, **options):
+        calls.append((model, list(starts), options["key"]))
+        return maximise(model, records, starts, **options)
+
+    monkeypatch.setattr(cascade_fit, "maximise", recorded)
+    model = dgp.Wiener(1, pairs=2, inducing=6)
+    fit = dgp.fit(model, bent, method="map", restarts=5, steps=60, workers=1, progress=False)
+    by_key = {key: (model, starts) for model, starts, key in calls}
+    quiet, first = by_key["without-process-noise"]
+    assert not quiet.layers[0].process_noise
+    assert len(first) == 2
+    assert len(by_key["cascade"][1]) == 5 == len(fit.start_energies)
+    directly = by_key["cascade"][1][0]
+    for one in by_key["cascade"][1][3:]:
+        assert not torch.equal(one["f_values"], directly["f_values"])
+        assert torch.equal(one["g_noise_gain_unit"], directly["g_noise_gain_unit"])

@@ -4,18 +4,22 @@ import math
 
 import numpy as np
 import pyro
+import pyro.distributions as dist
 import pytest
 import torch
 
 import pyro_dynogp as dgp
+from pyro_dynogp.inference.checkpoints import NOTHING_KEPT
 from pyro_dynogp.inference.guides import GaussianGuide, MixtureGuide
-from pyro_dynogp.inference.posterior import MOST_OPTIMA, spread
+from pyro_dynogp.inference.maximum import Optimum
+from pyro_dynogp.inference.posterior import LEAST_WEIGHT, MOST_OPTIMA, _weighted, spread
+from pyro_dynogp.inference.potential import Potential
 from tests.inference.cascades import FAST, wiener
 
 
 @pytest.fixture(scope="module")
 def several(bent):
-    options = {**FAST, "restarts": 6, "steps": 20, "draws": 400}
+    options = {**FAST, "restarts": 6, "steps": 60, "draws": 400}
     return dgp.fit(wiener(), bent, **options)
 
 
@@ -31,6 +35,31 @@ def test_consists_of_distinct_optima_by_weight(several):
     assert len({tuple(row.tolist()) for row in decays}) == K
     assert torch.equal(several.mode["g_log_decay"], decays[0])
     assert several.diagnostics["elbo"] == pytest.approx(several.elbo[-50:].mean())
+
+
+def test_a_needle_does_not_lead_because_it_is_high():
+    shares = torch.tensor([0.02, 0.28, 0.7]).double()
+    centres, widths = torch.tensor([-2.0, 2.0, 0.0]).double(), torch.tensor([1e-3, 0.2, 0.2])
+
+    def hills(record):
+        x = pyro.sample("x", dist.Normal(torch.tensor(0.0).double(), 100.0))
+        each = dist.Normal(centres, widths.double()).log_prob(x.unsqueeze(-1))
+        pyro.factor("hills", torch.logsumexp(shares.log() + each, -1))
+
+    optima = []
+    for centre in centres:
+        values = {"x": centre}
+        energy = -float(Potential(hills, (None,), values).log_joint(values))
+        optima.append(Optimum(energy, values, np.zeros(1), ""))
+    optima.sort(key=lambda one: one.energy)
+    assert float(optima[0].values["x"]) == -2.0  # the needle is the highest
+    leading, weights = _weighted(hills, None, optima, 1, NOTHING_KEPT, False)
+    tempered = (shares ** (1.0 / spread(optima[0].values))).sort(descending=True).values
+    kept = tempered[tempered / tempered.sum() >= LEAST_WEIGHT]
+    assert [float(values["x"]) for values in leading] == [0.0, 2.0]
+    assert weights.numpy() == pytest.approx((kept / kept.sum()).numpy(), abs=0.01)
+    alone, one = _weighted(hills, None, optima[:1], 1, NOTHING_KEPT, False)
+    assert (len(alone), one.tolist()) == (1, [1.0])
 
 
 def test_draws_come_from_each_optimum_in_its_share(several):

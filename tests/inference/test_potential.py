@@ -5,6 +5,7 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
+from scipy import stats
 from scipy.optimize import approx_fprime
 
 import pyro_dynogp as dgp
@@ -103,3 +104,40 @@ def test_every_latent_site_needs_a_value():
 
     with pytest.raises(ValueError, match=r"values: expected a value for every latent site.*'z'"):
         Potential(model, (), {"x": torch.tensor(0.0)})
+
+
+def test_evidence_of_a_linear_model_is_exact():
+    rng = np.random.default_rng(3)
+    A = rng.standard_normal((9, 3))
+    y, sd, prior = rng.standard_normal(9), 0.4, 1.3
+
+    def model():
+        x = pyro.sample("x", dist.Normal(torch.zeros(3).double(), prior).to_event(1))
+        pyro.sample("y", dist.Normal(torch.tensor(A) @ x, sd).to_event(1), obs=torch.tensor(y))
+
+    mode = np.linalg.solve(A.T @ A / sd**2 + np.eye(3) / prior**2, A.T @ y / sd**2)
+    potential = Potential(model, (), {"x": torch.tensor(mode)})
+    covariance = prior**2 * A @ A.T + sd**2 * np.eye(9)
+    expected = stats.multivariate_normal(np.zeros(9), covariance).logpdf(y)
+    assert potential.log_evidence(potential.at, widest=3.0) == pytest.approx(expected, rel=1e-6)
+
+
+def test_evidence_prefers_a_broad_hill_to_a_needle():
+    weights = torch.tensor([0.02, 0.98]).double().log()
+
+    def model():
+        x = pyro.sample("x", dist.Normal(torch.tensor(0.0).double(), 3.0))
+        hills = dist.Normal(torch.tensor([-2.0, 2.0]).double(), torch.tensor([1e-3, 0.5]).double())
+        pyro.factor("hills", torch.logsumexp(weights + hills.log_prob(x.unsqueeze(-1)), -1))
+
+    found = {}
+    for name, at in (("needle", -2.0), ("hill", 2.0)):
+        potential = Potential(model, (), {"x": torch.tensor(at).double()})
+        found[name] = (
+            -potential.value_and_gradient(np.array([at]))[0],
+            potential.log_evidence(potential.at, widest=3.0),
+        )
+    assert found["needle"][0] > found["hill"][0] + 2.0
+    # Both hills stand where the prior is equal: shares of the mass are the weights.
+    difference = found["hill"][1] - found["needle"][1]
+    assert difference == pytest.approx(np.log(49.0), abs=0.3)

@@ -45,10 +45,11 @@ def cascade_model(task: Task) -> dgp.Cascade:
     """The architecture: in the last layer one signal, in the others `width`."""
     last = len(task.architecture) - 1
     layers: list[dgp.Dynamic | dgp.Static] = []
+    noisy = iter(task.noisy)
     for place, part in enumerate(task.architecture):
         outputs = 1 if place == last else task.width
         if isinstance(part, int):
-            layers.append(dgp.Dynamic(outputs=outputs, pairs=part))
+            layers.append(dgp.Dynamic(outputs=outputs, pairs=part, process_noise=next(noisy)))
         else:
             layers.append(dgp.Static(outputs=outputs))
     return dgp.Cascade(task.train.n_inputs, tuple(layers))
@@ -102,7 +103,7 @@ def _predictions(fit: dgp.Fit | dgp.Stack, task: Task) -> Sequence[Predicted]:
     """Free runs: from the filtered state where the test follows, else from an unknown one."""
     found = []
     for test in test_records(task):
-        options = {"process_noise": task.process_noise, "samples": SAMPLES}
+        options = {"process_noise": task.test_process_noise, "samples": SAMPLES}
         if task.follows:
             run = fit.forecast(task.train, test, **options)
         else:

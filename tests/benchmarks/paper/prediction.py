@@ -34,7 +34,8 @@ class Task:
         inputs: inputs (n_k, n_u) of each test record.
         follows: whether the (only) test record begins right after the training record; else every
             test record starts from rest.
-        process_noise: whether the test period has any, as the protocol says.
+        test_process_noise: whether the test period has any, as the protocol says.
+        noisy: for each dynamic layer, whether the architecture gives it process noise.
         architecture: layers in order: a number of conjugate pairs for linear dynamics, "static"
             for a nonlinear function; all but the last have `width` signals.
         width: number of signals between layers.
@@ -45,7 +46,8 @@ class Task:
     train: dgp.Record
     inputs: Sequence[np.ndarray]
     follows: bool
-    process_noise: bool
+    test_process_noise: bool
+    noisy: tuple[bool, ...]
     architecture: tuple[int | str, ...]
     width: int
     seconds: float

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from ..prediction import Outcome, Task
-from . import deep_gp, dynonet_peer, gp_narx, narmax
+from tests.benchmarks.paper.peers import deep_gp, dynonet_peer, gp_narx, narmax
+from tests.benchmarks.paper.prediction import Outcome, Task
 
 PEERS: dict[str, Callable[[Task], Outcome]] = {
     "dynoNet": dynonet_peer.predict,

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from gpytorch.models.deep_gps import DeepGP, DeepGPLayer
 
-from ..prediction import Outcome, Predicted, Task
-from .lags import Scaled, lagged
+from tests.benchmarks.paper.peers.lags import Scaled, lagged
+from tests.benchmarks.paper.prediction import Outcome, Predicted, Task
 
 # Lags of each input; fewer where there are many inputs.
 LAGS, FEW_LAGS, MOST_INPUTS = 20, 5, 5

@@ -9,8 +9,8 @@ import time
 import numpy as np
 import torch
 
-from ..prediction import Outcome, Predicted, Task
-from .lags import Scaled
+from tests.benchmarks.paper.peers.lags import Scaled
+from tests.benchmarks.paper.prediction import Outcome, Predicted, Task
 
 STARTS = 3
 # Shares of the time by which all starts have been tried, and by which the best of them has ended;

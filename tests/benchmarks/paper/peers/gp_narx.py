@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from scipy.cluster.vq import kmeans2
 
-from ..prediction import Outcome, Predicted, Task
-from .lags import Scaled, filled, lagged, missing_note
+from tests.benchmarks.paper.peers.lags import Scaled, filled, lagged, missing_note
+from tests.benchmarks.paper.prediction import Outcome, Predicted, Task
 
 LAGS = 5
 TRAJECTORIES = 100

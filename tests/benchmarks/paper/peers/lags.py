@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..prediction import Task
+from tests.benchmarks.paper.prediction import Task
 
 
 @dataclass(frozen=True, eq=False)

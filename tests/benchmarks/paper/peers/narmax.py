@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ..prediction import Outcome, Predicted, Task
-from .lags import Scaled, filled, missing_note
+from tests.benchmarks.paper.peers.lags import Scaled, filled, missing_note
+from tests.benchmarks.paper.prediction import Outcome, Predicted, Task
 
 # Lags of the output; the inputs are seen at their present value and as many lags.
 LAGS = 5
