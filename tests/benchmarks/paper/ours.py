@@ -93,8 +93,7 @@ def _fitted(model: dgp.Cascade | dgp.LinearDynamicGP, task: Task) -> Outcome:
     return Outcome(
         _predictions(fit, task),
         seconds,
-        len(fit.history),
-        step_seconds(fit, task.train),
+        step_seconds=step_seconds(fit, task.train),
         figures={"noise_sd": float(fit.noise_sd[0])},
     )
 
