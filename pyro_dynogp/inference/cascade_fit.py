@@ -105,29 +105,29 @@ def best_optima(
 ) -> list[Optimum]:
     """Optima of the collapsed model from all starts, and from what is learnt, best first.
 
-    Where static layers see process noise every start goes two ways, which count as two restarts:
-    as it is, and after some steps without any process noise. Such noise can explain all that
-    dynamics and functions should, from a poor start to a high density and poor forecasts.
+    Where static layers see process noise the starts climb without any first, which needs no filter,
+    and the better half of them goes on with it. Such noise can explain all that dynamics and
+    functions should: from a poor start to a high density and poor forecasts.
     """
+    starts = starting_points(model, records, restarts, steps, seed, workers, progress, checkpoints)
     argument = records[0] if len(records) == 1 else tuple(records)
     quiet = without_process_noise(model)
-    count = restarts if quiet == model else (restarts + 1) // 2
-    starts = starting_points(model, records, count, steps, seed, workers, progress, checkpoints)
-    if restarts > count:
+    if quiet != model:
         deterministic = maximise(
             quiet,
             argument,
-            starts[: restarts - count],
+            starts,
             optimizer=optimizer,
-            steps=max(1, steps // 5),
+            steps=max(1, steps // 2),
             seed=seed,
             workers=workers,
             progress=progress,
             checkpoints=checkpoints,
             key="without-process-noise",
-            kept=1.0,
+            kept=0.5,
         )
-        starts = [*starts, *(grown(one.values, starts[0]) for one in deterministic)]
+        better = deterministic[: (restarts + 1) // 2]
+        starts = [grown(one.values, starts[0]) for one in better]
     if learnt is not None:
         starts = [grown(learnt, starts[0]), *starts]
     return maximise(

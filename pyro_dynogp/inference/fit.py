@@ -59,7 +59,7 @@ def fit(
     otherwise, to that of inducing values and first states around up to four optima, with everything
     else at the optimum: see `pyro_dynogp.inference.posterior`);
     "nuts" samples it. The starts of a cascade are the best linear fits, spread over its layers;
-    half of them climb without process noise first, where static layers see any.
+    where static layers see process noise they climb without any first, and the better half goes on.
 
     With another `guide` a cascade keeps its trajectories as sample sites, and Pyro's SVI fits them
     and the parameters together, from every start; the best is kept by its ELBO.
