@@ -111,35 +111,27 @@ def best_optima(
     """
     starts = starting_points(model, records, restarts, steps, seed, workers, progress, checkpoints)
     argument = records[0] if len(records) == 1 else tuple(records)
-    quiet = without_process_noise(model)
-    if quiet != model:
-        deterministic = maximise(
-            quiet,
+
+    def climb(target: Cascade, values: Sequence[Values], count: int, key: str) -> list[Optimum]:
+        return maximise(
+            target,
             argument,
-            starts,
+            values,
             optimizer=optimizer,
-            steps=max(1, steps // 2),
+            steps=count,
             seed=seed,
             workers=workers,
             progress=progress,
             checkpoints=checkpoints,
-            key="without-process-noise",
+            key=key,
             kept=0.5,
         )
+
+    quiet = without_process_noise(model)
+    if quiet != model:
+        deterministic = climb(quiet, starts, max(1, steps // 2), "without-process-noise")
         better = deterministic[: (restarts + 1) // 2]
         starts = [grown(one.values, starts[0]) for one in better]
     if learnt is not None:
         starts = [grown(learnt, starts[0]), *starts]
-    return maximise(
-        model,
-        argument,
-        starts,
-        optimizer=optimizer,
-        steps=steps,
-        seed=seed,
-        workers=workers,
-        progress=progress,
-        checkpoints=checkpoints,
-        key="cascade",
-        kept=0.5,
-    )
+    return climb(model, starts, steps, "cascade")

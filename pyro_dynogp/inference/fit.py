@@ -186,10 +186,10 @@ def fit(
             "fit: no start reached a point where the likelihood can be evaluated. Check the "
             "record for jumps of many orders of magnitude, or try fewer pairs."
         )
-    common = _common(model, method, optima, seed, records)
-    best = optima[0]
     if method == "map":
         return at_optimum(model, optima, seed, records)
+    common = _common(model, method, optima, seed, records)
+    best = optima[0]
     if method == "svi":
         chosen = hyperparameters or ("map" if cascade else "multivariate normal")
         found = posterior_of(

@@ -119,17 +119,17 @@ def posterior_of(
             target, (argument,), dict(best), independent=independent, progress=progress, **options
         )
         return Posterior(found.guide, best, found.elbo, 1)
+    if not any(_is_free(name) for name in optima[0].values):
+        raise invalid(
+            "hyperparameters",
+            expected="'normal' or 'multivariate normal' for a cascade without static layers",
+            got="'map'",
+        )
     leading, weights = _weighted(target, argument, optima, workers, checkpoints, progress)
     tasks = []
     for index, values in enumerate(leading):
         free = {k: v for k, v in values.items() if _is_free(k)}
         fixed = {k: v for k, v in values.items() if k not in free}
-        if not free:
-            raise invalid(
-                "hyperparameters",
-                expected="'normal' or 'multivariate normal' for a cascade without static layers",
-                got="'map'",
-            )
         own = {**options, "key": f"posterior-{index}", "progress": progress and len(leading) == 1}
         tasks.append(_Task(target, argument, fixed, free, own))
     found_all = parallel_map(

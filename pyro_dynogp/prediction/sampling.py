@@ -73,14 +73,10 @@ class Randomness:
     @property
     def first(self) -> Randomness:
         """The first numbers of each posterior draw: enough where none of them is used."""
-
-        def cut(x: Tensor) -> Tensor:
-            return x[:1]
-
         return Randomness(
-            cut(self.state),
-            {name: cut(x) for name, x in self.innovations.items()},
-            {name: cut(x) for name, x in self.residual.items()},
+            self.state[:1],
+            {name: x[:1] for name, x in self.innovations.items()},
+            {name: x[:1] for name, x in self.residual.items()},
         )
 
 
@@ -115,7 +111,7 @@ class Switches:
         names = {
             one.name
             for one, layer in zip(system.wires, system.layers, strict=True)
-            if isinstance(layer, DynamicSystem) and layer.modes.L.shape[-1]
+            if isinstance(layer, DynamicSystem) and layer.modes.has_process_noise
         }
         return cls(True, frozenset(names if process_noise else ()), True, several_channels)
 

@@ -93,14 +93,18 @@ def seconds(call: Callable[[], object], repeats: int = 3) -> float:
 
 def measure(kind: str, name: str, n: int) -> tuple[float, float]:
     """Seconds a step and peak memory [GB], in a process of its own."""
+    return apart(__name__, f"one({kind!r}, {name!r}, {n})")
+
+
+def apart(module: str, call: str) -> tuple[float, float]:
+    """A number that a call of a module gives, and its peak memory [GB], in a process of its own."""
     code = (
-        "from tests.benchmarks import cascade_cost as c; import resource; "
-        f"print(c.one({kind!r}, {name!r}, {n}), "
-        "resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6)"
+        f"import {module} as m; import resource; "
+        f"print(m.{call}, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6)"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    time_, memory = out.stdout.split()[-2:]
-    return float(time_), float(memory)
+    value, memory = out.stdout.split()[-2:]
+    return float(value), float(memory)
 
 
 def one(kind: str, name: str, n: int) -> float:

@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy import stats
 
+from tests.benchmarks.markdown import table
 from tests.discrepancy.plants import CATALOGUE, OUTSIDE, STRENGTHS
 
 Row = Mapping[str, Any]
@@ -132,11 +133,6 @@ def _share(count: int, total: int) -> str:
     return f"{text} ({count} of {total}; {100 * low:.1f} to {100 * high:.1f} %)"
 
 
-def _table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    body = [head, ["---"] * len(head), *lines]
-    return "\n".join("| " + " | ".join(line) + " |" for line in body)
-
-
 def _names(found: Mapping[str, Counter[str]]) -> list[str]:
     """Columns of the confusion matrix: all names, and what else came up."""
     others = {name for row in found.values() for name in row} - set(COLUMNS)
@@ -152,7 +148,7 @@ def _confusion_table(rows: Sequence[Row]) -> str:
         right = _right_name(effect)
         cells[right] = f"**{counts[right]}**"
         lines.append([effect, *cells.values()])
-    return _table(["planted", *names], lines)
+    return table(["planted", *names], lines)
 
 
 def _strength_table(rows: Sequence[Row]) -> str:
@@ -174,7 +170,7 @@ def _strength_table(rows: Sequence[Row]) -> str:
                  _over_floor(right, "after"),
                  _median(own, lambda row: row["after"]["coverage_95"])]
             )  # fmt: skip
-    return _table(head, lines)
+    return table(head, lines)
 
 
 def _over_floor(rows: Sequence[Row], when: str) -> str:
@@ -192,7 +188,7 @@ def _outcome_table(rows: Sequence[Row]) -> str:
         if row["effect"] in (OUTSIDE, NOTHING)
     )
     lines = [[*key, str(count)] for key, count in sorted(counts.items())]
-    return _table(["planted", "strength", "outcome", "accepted", "plants"], lines)
+    return table(["planted", "strength", "outcome", "accepted", "plants"], lines)
 
 
 def confusion_picture(rows: Sequence[Row], path: Path) -> None:

@@ -27,13 +27,20 @@ def load(seed: int) -> tuple[dgp.Record, dgp.Record, np.ndarray]:
     """
     folder = os.environ.get(VARIABLE)
     if folder is None:
-        data = dgp.datasets.load("wiener", seed=seed)
-        return data.train, data.test, data.truth.clean_test[:, 0]
+        return simulated(seed)
     arrays = np.load(Path(folder) / f"seed_{seed}.npz")
     t, y, clean = (arrays[name].ravel() for name in ("t", "y", "y_clean"))
     u = arrays["u"].reshape(len(t), -1)
     train, test = dgp.Record(t[1:], u[1:], y[:-1, None]).split(TRAINING)
     return train, test, clean[:-1][TRAINING:]
+
+
+def simulated(seed: int) -> tuple[dgp.Record, dgp.Record, np.ndarray]:
+    """The same of our own simulator."""
+    data = dgp.datasets.load("wiener", seed=seed)
+    assert data.truth is not None
+    assert isinstance(data.train, dgp.Record)
+    return data.train, data.test, data.truth.clean_test[:, 0]
 
 
 def identify(seed: int, **options: Any) -> dict[str, float]:

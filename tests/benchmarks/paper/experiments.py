@@ -1,24 +1,19 @@
 """The paper's experiments: records, architectures, budgets, and the figures to compare with.
 
 Every record comes with the package, but for the ten published records of the simulated study (our
-own simulator serves without them) and all ten realisations of the Wiener-Hammerstein circuit.
+own simulator serves without them).
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 
 import pyro_dynogp as dgp
 from tests.benchmarks import wiener
 from tests.benchmarks.paper.prediction import Task
-
-# Folder with WH_EstimationExample.csv, for training on all ten realisations.
-CIRCUIT = "PYRO_DYNOGP_CIRCUIT"
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,10 +68,8 @@ def _wiener(seed: int) -> tuple[dgp.Record, dict[str, dgp.Record], dict[str, np.
 
 
 def _own_wiener(seed: int) -> tuple[dgp.Record, dict[str, dgp.Record], dict[str, np.ndarray]]:
-    data = dgp.datasets.load("wiener", seed=seed)
-    assert data.truth is not None
-    assert isinstance(data.train, dgp.Record)
-    return data.train, {"test": data.test}, {"test": data.truth.clean_test[:, 0]}
+    train, test, clean = wiener.simulated(seed)
+    return train, {"test": test}, {"test": clean}
 
 
 def _circuit(seed: int) -> tuple[dgp.Record, dict[str, dgp.Record], dict[str, np.ndarray]]:
@@ -142,8 +135,8 @@ def _electricity(seed: int) -> tuple[dgp.Record, dict[str, dgp.Record], dict[str
 STUDY = Experiment(
     "simulated Wiener", _wiener, (5, "static"), (True,), seconds=90.0, seeds=tuple(range(10)),
     test_process_noise=False, simulated=True,
-    note="Published records, seeds 0 to 9; RMSE and CRPS over those of the true predictive "
-    "distribution.",
+    note=f"Seeds 0 to 9 of the published records where {wiener.VARIABLE} names their folder, else "
+    "of our own simulator; RMSE and CRPS over those of the true predictive distribution.",
 )  # fmt: skip
 
 EXPERIMENTS = {
@@ -180,12 +173,3 @@ EXPERIMENTS = {
         note="Scaled with the training period only; the paper's run scales with the test, too.",
     ),
 }  # fmt: skip
-
-
-def ten_realisations() -> tuple[dgp.Record, ...] | None:
-    """All training records of the circuit, None where the original file is not at hand."""
-    folder = os.environ.get(CIRCUIT)
-    if folder is None:
-        return None
-    train = dgp.datasets.load("wh_process_noise", path=Path(folder)).train
-    return train if isinstance(train, tuple) else (train,)

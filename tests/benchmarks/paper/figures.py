@@ -10,9 +10,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from tests.benchmarks.paper.experiments import Experiment
+from tests.benchmarks.paper.prediction import OURS, folder_name
 
 Row = Mapping[str, Any]
-OURS = "pyro_dynogp"
 # A long test record is shown in part.
 SHOWN = 1500
 # Samples over which errors of the simulated study are averaged along time.
@@ -21,8 +21,7 @@ COLOURS = ("#1b6ca8", "#d1495b", "#3a7d44", "#8a5a9e", "#b08900", "#5c5c5c", "#2
 
 
 def _arrays(folder: Path, row: Row) -> Mapping[str, np.ndarray]:
-    name = str(row["method"]).replace(", ", "-").replace(" ", "-")
-    with np.load(folder / name / f"{row['seed']}.npz") as file:
+    with np.load(folder / folder_name(row["method"]) / f"{row['seed']}.npz") as file:
         return {key: file[key] for key in file.files}
 
 
@@ -42,7 +41,7 @@ def experiment_figure(experiment: Experiment, rows: Sequence[Row], folder: Path)
         if method == OURS:
             top.fill_between(
                 time, arrays[f"{name}/low"][here], arrays[f"{name}/high"][here],
-                color=colour, alpha=0.25, lw=0, label="95 %, pyro_dynogp",
+                color=colour, alpha=0.25, lw=0, label=f"95 %, {OURS}",
             )  # fmt: skip
         if method in (OURS, "dynoNet", "GP-NARX"):
             top.plot(time, arrays[f"{name}/mean"][here], color=colour, lw=1.0, label=method)
@@ -69,15 +68,13 @@ def study_figure(experiment: Experiment, rows: Sequence[Row], folder: Path) -> N
     """Absolute error and CRPS along the test, medians over systems in units of the noise floor."""
     figure = Figure(figsize=(10.0, 6.4), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
-    known = {seed: experiment.load(seed) for seed in {row["seed"] for row in rows}}
+    known = {seed: experiment.load(seed)[1]["test"] for seed in {row["seed"] for row in rows}}
     methods = list(dict.fromkeys(row["method"] for row in rows))
     for method, colour in zip(methods, COLOURS, strict=False):
         errors, crps = [], []
         for row in (r for r in rows if r["method"] == method):
-            _, tests, clean = known[row["seed"]]
-            record = tests["test"]
-            y = record.outputs[:, 0]
-            floor = float(np.sqrt(np.mean((y - clean["test"]) ** 2)))
+            record = known[row["seed"]]
+            y, floor = record.outputs[:, 0], row["scores"]["test"]["floor"]
             arrays = _arrays(folder, row)
             errors.append(_smooth(np.abs(arrays["test/mean"] - y)) / floor)
             if "test/crps" in arrays:

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 
 import pyro_dynogp as dgp
 from tests.benchmarks import cascade_cost
+from tests.benchmarks.markdown import table
 from tests.benchmarks.paper.page import number
 from tests.benchmarks.paper.peers import PEERS
-from tests.benchmarks.paper.prediction import Task
+from tests.benchmarks.paper.prediction import OURS, Task
 
 LENGTHS = (500, 1000, 2000, 4000, 8000, 100_000)
 # Peers learn for so long; a pass is timed within that. Above this length they are left out.
 SECONDS, LONGEST_PEER = 30.0, 8000
-OURS = "pyro_dynogp"
 
 
 def one(method: str, n: int) -> float:
@@ -40,36 +37,23 @@ def one(method: str, n: int) -> float:
     return PEERS[method](task).step_seconds
 
 
-def measured(method: str, n: int) -> tuple[float, float]:
-    """Seconds of a pass and peak memory [GB], in a process of its own."""
-    code = (
-        "import json, resource; from tests.benchmarks.paper import growth; "
-        f"s = growth.one({method!r}, {n}); "
-        "print(json.dumps([s, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6]))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    seconds, memory = json.loads(done.stdout.strip().splitlines()[-1])
-    return float(seconds), float(memory)
-
-
 def run(folder: Path) -> str:
     """Table of all methods and lengths, with the slope between the last two lengths."""
     del folder
     head = ["method", *(f"n = {n}" for n in LENGTHS), "grows as"]
-    lines = [head, ["---"] * len(head)]
+    lines = []
     for method in (OURS, *(name for name in PEERS if name != "NARMAX")):
         lengths = [n for n in LENGTHS if method == OURS or n <= LONGEST_PEER]
-        found = {n: measured(method, n) for n in lengths}
+        found = {n: cascade_cost.apart(__name__, f"one({method!r}, {n})") for n in lengths}
         a, b = lengths[-2:]
         slope = np.log(found[b][0] / found[a][0]) / np.log(b / a)
         cells = [f"{number(s)} s, {number(m)} GB" for s, m in found.values()]
         cells += [""] * (len(LENGTHS) - len(cells))
         lines.append([method, *cells, f"n^{slope:.2f}"])
         print(lines[-1], flush=True)
-    table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
     return (
         "Wiener model, two inputs: one pass over the training record (value and gradient of the "
         "marginal density; an iteration of dynoNet and exact GP-NARX; an epoch of mini-batches of "
         "the deep GP) and peak memory. GP-NARX is exact up to 2500 samples, sparse above. NARMAX "
-        f"has no iterations.\n\n{table}"
+        f"has no iterations.\n\n{table(head, lines)}"
     )

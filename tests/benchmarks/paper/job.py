@@ -16,12 +16,12 @@ import numpy as np
 from tests.benchmarks.paper import ours
 from tests.benchmarks.paper.experiments import EXPERIMENTS
 from tests.benchmarks.paper.peers import PEERS
-from tests.benchmarks.paper.prediction import Outcome, Task, scores
+from tests.benchmarks.paper.prediction import OURS, Outcome, Task, crps_by_time, scores
 
 METHODS: dict[str, Callable[[Task], Outcome]] = {
-    "pyro_dynogp": ours.cascade,
-    "pyro_dynogp, stacked": ours.stacked,
-    "pyro_dynogp, linear": ours.linear,
+    OURS: ours.cascade,
+    ours.STACK: ours.stacked,
+    f"{OURS}, linear": ours.linear,
     **PEERS,
 }
 
@@ -75,13 +75,6 @@ def against_clean(mean: np.ndarray, y: np.ndarray, clean: np.ndarray) -> dict[st
         "mae_first_150": float(error[:150].mean()),
         "mae_after": float(error[150:].mean()),
     }
-
-
-def crps_by_time(samples: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """CRPS (n,) of every sample."""
-    import scoringrules
-
-    return np.asarray(scoringrules.crps_ensemble(y, samples.T))
 
 
 if __name__ == "__main__":

@@ -9,9 +9,10 @@ import numpy as np
 
 import pyro_dynogp as dgp
 from pyro_dynogp.inference.potential import Potential
-from tests.benchmarks.paper.prediction import Outcome, Predicted, Task
+from tests.benchmarks.paper.prediction import OURS, Outcome, Predicted, Task
 
 SAMPLES = 400
+STACK = f"{OURS}, stacked"
 # A stack is made of fits from this many seeds.
 STACKED = 3
 

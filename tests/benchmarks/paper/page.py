@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from tests.benchmarks.markdown import table
 from tests.benchmarks.paper.experiments import EXPERIMENTS, Experiment
 from tests.benchmarks.paper.figures import experiment_figure, study_figure
+from tests.benchmarks.paper.prediction import OURS
 
 Row = Mapping[str, Any]
 # Column -> score, and whether it carries the output's unit.
@@ -100,7 +102,7 @@ def _table(experiment: Experiment, rows: Sequence[Row], test: str, published: bo
                 for score in columns.values()
             ]
             lines.append([name, *cells])
-    return _markdown(lines)
+    return table(lines[0], lines[1:])
 
 
 def _costs(rows: Sequence[Row]) -> str:
@@ -118,7 +120,7 @@ def _costs(rows: Sequence[Row]) -> str:
             spread(1000.0 * passes / length),
             spread(np.array([row["memory_gb"] for row in own])),
         ])  # fmt: skip
-    return _markdown(lines)
+    return table(lines[0], lines[1:])
 
 
 LENGTHS: dict[str, int] = {}
@@ -133,14 +135,14 @@ def _length(experiment: str) -> int:
 
 def _targets(experiment: Experiment, rows: Sequence[Row]) -> list[str]:
     """What the project set out to reach, and what it came to, in a line each."""
-    own = [row for row in rows if row["method"] == "pyro_dynogp"]
+    own = [row for row in rows if row["method"] == OURS]
     if not own or not experiment.targets:
         return []
     tests = list(own[0]["scores"])
     lines = []
     for target, limit in experiment.targets.items():
         score, _, test = target.partition(" ")
-        found = float(np.median(values_of(own, "pyro_dynogp", test or tests[0], score)))
+        found = float(np.median(values_of(own, OURS, test or tests[0], score)))
         verdict = "reached" if found <= limit else f"not reached, {found / limit - 1.0:.0%} above"
         where = f" ({test})" if test else ""
         lines.append(
@@ -176,8 +178,3 @@ def spread(values: np.ndarray) -> str:
     if len(values) == 1:
         return middle
     return f"{middle} ({number(float(values.min()))} to {number(float(values.max()))})"
-
-
-def _markdown(lines: Sequence[Sequence[str]]) -> str:
-    head, *body = lines
-    return "\n".join("| " + " | ".join(line) + " |" for line in [head, ["---"] * len(head), *body])

@@ -11,6 +11,14 @@ import scoringrules
 
 import pyro_dynogp as dgp
 
+# What this library's default is called among the methods.
+OURS = "pyro_dynogp"
+
+
+def folder_name(method: str) -> str:
+    """Name of the folder of a method's results."""
+    return method.replace(", ", "-").replace(" ", "-")
+
 
 @dataclass(frozen=True, eq=False)
 class Predicted:
@@ -97,7 +105,12 @@ def scores(predicted: Predicted, y: np.ndarray, skip: int = 0) -> dict[str, floa
     z = (y[keep] - mean) / sd
     return {
         **found,
-        "crps": float(np.mean(scoringrules.crps_ensemble(y[keep], draws.T))),
+        "crps": float(np.mean(crps_by_time(draws, y[keep]))),
         "coverage_95": float(np.mean((low <= y[keep]) & (y[keep] <= high))),
         "log_density": float(np.mean(-0.5 * z**2 - np.log(sd) - 0.5 * math.log(2 * math.pi))),
     }
+
+
+def crps_by_time(samples: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """CRPS (n,) of every sample of y (n,), from draws (S, n)."""
+    return np.asarray(scoringrules.crps_ensemble(y, samples.T))

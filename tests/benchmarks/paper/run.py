@@ -13,7 +13,9 @@ from tqdm import tqdm
 
 from tests.benchmarks.paper.experiments import EXPERIMENTS
 from tests.benchmarks.paper.job import METHODS
+from tests.benchmarks.paper.ours import STACK
 from tests.benchmarks.paper.page import page
+from tests.benchmarks.paper.prediction import OURS, folder_name
 
 # A method is given this many times its budget before it is stopped; it should stop by itself.
 GRACE = 4.0
@@ -34,8 +36,8 @@ def jobs(
 
 # The second study is for the methods that its criteria name; stacking is for short records.
 LEFT_OUT = {
-    *(("wiener_own", m) for m in METHODS if m not in ("pyro_dynogp", "dynoNet", "GP-NARX")),
-    *((e, "pyro_dynogp, stacked") for e in EXPERIMENTS if not e.startswith("drives")),
+    *(("wiener_own", m) for m in METHODS if m not in (OURS, "dynoNet", "GP-NARX")),
+    *((e, STACK) for e in EXPERIMENTS if not e.startswith("drives")),
 }
 
 
@@ -65,7 +67,7 @@ def run(
 def file_of(base: Path, job: tuple[str, str, int]) -> Path:
     """Where the result of a job is kept."""
     experiment, method, seed = job
-    return base / experiment / method.replace(", ", "-").replace(" ", "-") / f"{seed}.json"
+    return base / experiment / folder_name(method) / f"{seed}.json"
 
 
 def _one(base: Path, job: tuple[str, str, int]) -> None:

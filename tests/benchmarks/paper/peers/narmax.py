@@ -66,6 +66,7 @@ def predict(task: Task) -> Outcome:
         u_past, y_past = data.past(LAGS + 1)
         u = np.concatenate([u_past, test])
         with warnings.catch_warnings(), np.errstate(over="ignore", invalid="ignore"):
+            # A polynomial that diverges overflows; where it does is cut, and the note says so.
             warnings.simplefilter("ignore", RuntimeWarning)
             run = model.predict(X=early(u), y=y_past[:, None])[LAGS + 1 :, 0]
         # Infinity less infinity is no number; it is counted with what is cut, at the mean.
