@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -16,6 +17,7 @@ from pyro_dynogp.inference.cascade_starts import (
 from pyro_dynogp.inference.checkpoints import Checkpoints
 from pyro_dynogp.inference.maximum import Optimizer, Optimum, maximise
 from pyro_dynogp.inference.starts import grown, starting_values
+from pyro_dynogp.layers.noise import TYPICAL
 from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.layers import Dynamic, Static
 from pyro_dynogp.parallel import seeded
@@ -26,6 +28,8 @@ GuideChoice = str | Mapping[str, Any] | Callable[..., Any] | None
 # Starts and iterations of the linear fits that come first.
 LINEAR_STARTS = 6
 LINEAR_STEPS = 150
+# Measurement noise, in sds of the outputs, from which starts without process noise climb at least.
+UNEXPLAINED = 0.5
 
 
 def starting_points(
@@ -87,6 +91,19 @@ def without_process_noise(model: Cascade) -> Cascade:
     return replace(model, layers=layers)
 
 
+def _louder(values: Values) -> Values:
+    """A start whose measurement noise can stand for what dynamics and functions lack as yet.
+
+    Linear fits leave that to process noise. Without any, noise of their size makes the density so
+    steep that the climb ends on its slopes.
+    """
+    least = {"noise_sd": UNEXPLAINED, "log_noise_constant": math.log(UNEXPLAINED / TYPICAL)}
+    return {
+        name: value.clamp_min(least[name]) if name in least else value
+        for name, value in values.items()
+    }
+
+
 def _one_output(records: Sequence[Record]) -> tuple[Record, ...]:
     return tuple(record.select(outputs=[record.output_names[0]]) for record in records)
 
@@ -105,9 +122,9 @@ def best_optima(
 ) -> list[Optimum]:
     """Optima of the collapsed model from all starts, and from what is learnt, best first.
 
-    Where static layers see process noise the starts climb without any first, which needs no filter,
-    and the better half of them goes on with it. Such noise can explain all that dynamics and
-    functions should: from a poor start to a high density and poor forecasts.
+    Where static layers see process noise the starts take half of the steps without any, which needs
+    no filter, and the better half of them takes the other half with it. Such noise can explain all
+    that dynamics and functions should: from a poor start to a high density and poor forecasts.
     """
     starts = starting_points(model, records, restarts, steps, seed, workers, progress, checkpoints)
     argument = records[0] if len(records) == 1 else tuple(records)
@@ -129,7 +146,9 @@ def best_optima(
 
     quiet = without_process_noise(model)
     if quiet != model:
-        deterministic = climb(quiet, starts, max(1, steps // 2), "without-process-noise")
+        steps = max(1, steps // 2)
+        starts = [_louder(start) for start in starts]
+        deterministic = climb(quiet, starts, steps, "without-process-noise")
         better = deterministic[: (restarts + 1) // 2]
         starts = [grown(one.values, starts[0]) for one in better]
     if learnt is not None:

@@ -78,6 +78,8 @@ def test_starts_climb_without_process_noise_first(monkeypatch, bent):
     assert len(first) == 5
     _, second, _ = by_key["cascade"]
     assert len(second) == 3 == len(fit.start_energies)
+    # Linear fits leave what is unexplained to process noise: here it is for measurement noise.
+    assert all(float(start["noise_sd"]) >= 0.5 for start in first)
     for start, optimum in zip(second, optima[:3], strict=True):
         assert torch.equal(start["f_values"], optimum.values["f_values"])
         # What the deterministic model lacks is as at the start.
