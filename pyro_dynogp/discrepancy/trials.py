@@ -12,7 +12,7 @@ from scipy.special import logsumexp
 
 from pyro_dynogp.criticism.densities import pointwise_log_density
 from pyro_dynogp.discrepancy.extend import Model, has_function
-from pyro_dynogp.inference.cascade_fit import starting_points
+from pyro_dynogp.inference.cascade_fit import climb, starting_points
 from pyro_dynogp.inference.checkpoints import NOTHING_KEPT
 from pyro_dynogp.inference.fit import at_optimum
 from pyro_dynogp.inference.maximum import Optimum, maximise
@@ -218,12 +218,13 @@ def _cascade(
     starts = starting_points(
         target, records, 1 if warm else count, linear, seed, 1, False, NOTHING_KEPT
     )
+    learnt = []
     if warm:
         assert base is not None
-        learnt = grown(base.mode, starts[0])
-        starts, steps = ([learnt], steps // 5) if short else ([learnt, starts[0]], steps // 2)
-    return maximise(
-        target, records[0], starts, optimizer="adam", steps=steps, seed=seed, workers=1, kept=0.5
+        learnt = [grown(base.mode, starts[0])]
+        starts, steps = ([], steps // 5) if short else (starts, steps // 2)
+    return climb(
+        target, records[0], starts, learnt, optimizer="adam", steps=steps, seed=seed, workers=1
     )
 
 

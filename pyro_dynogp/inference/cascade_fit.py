@@ -14,7 +14,7 @@ from pyro_dynogp.inference.cascade_starts import (
     plans,
     starting_point,
 )
-from pyro_dynogp.inference.checkpoints import Checkpoints
+from pyro_dynogp.inference.checkpoints import NOTHING_KEPT, Checkpoints
 from pyro_dynogp.inference.maximum import Optimizer, Optimum, maximise
 from pyro_dynogp.inference.starts import grown, starting_values
 from pyro_dynogp.layers.noise import TYPICAL
@@ -120,37 +120,46 @@ def best_optima(
     checkpoints: Checkpoints,
     learnt: Values | None = None,
 ) -> list[Optimum]:
-    """Optima of the collapsed model from all starts, and from what is learnt, best first.
-
-    Where static layers see process noise the starts take half of the steps without any, which needs
-    no filter, and the better half of them takes the other half with it. Such noise can explain all
-    that dynamics and functions should: from a poor start to a high density and poor forecasts.
-    """
+    """Optima of the collapsed model from all starts, and from what is learnt, best first."""
     starts = starting_points(model, records, restarts, steps, seed, workers, progress, checkpoints)
-    argument = records[0] if len(records) == 1 else tuple(records)
+    return climb(
+        model,
+        records[0] if len(records) == 1 else tuple(records),
+        starts,
+        [] if learnt is None else [grown(learnt, starts[0])],
+        optimizer=optimizer,
+        steps=steps,
+        seed=seed,
+        workers=workers,
+        progress=progress,
+        checkpoints=checkpoints,
+    )
 
-    def climb(target: Cascade, values: Sequence[Values], count: int, key: str) -> list[Optimum]:
-        return maximise(
-            target,
-            argument,
-            values,
-            optimizer=optimizer,
-            steps=count,
-            seed=seed,
-            workers=workers,
-            progress=progress,
-            checkpoints=checkpoints,
-            key=key,
-            kept=0.5,
-        )
 
+def climb(
+    model: Cascade,
+    records: Record | Sequence[Record],
+    starts: Sequence[Values],
+    learnt: Sequence[Values],
+    *,
+    steps: int,
+    checkpoints: Checkpoints = NOTHING_KEPT,
+    **options: Any,
+) -> list[Optimum]:
+    """Optima of the collapsed model from fresh starts and from what is learnt, best first.
+
+    Where static layers see process noise fresh starts take half of the steps without any, which
+    needs no filter, and the better half of them takes the other half with it. Such noise can
+    explain all that dynamics and functions should: from a poor start to a high density and poor
+    forecasts.
+    """
+    options |= {"checkpoints": checkpoints, "kept": 0.5}
     quiet = without_process_noise(model)
-    if quiet != model:
+    if quiet != model and starts:
         steps = max(1, steps // 2)
-        starts = [_louder(start) for start in starts]
-        deterministic = climb(quiet, starts, steps, "without-process-noise")
-        better = deterministic[: (restarts + 1) // 2]
+        key = "without-process-noise"
+        louder = [_louder(start) for start in starts]
+        found = maximise(quiet, records, louder, steps=steps, key=key, **options)
+        better = found[: (len(starts) + 1) // 2]
         starts = [grown(one.values, starts[0]) for one in better]
-    if learnt is not None:
-        starts = [grown(learnt, starts[0]), *starts]
-    return climb(model, starts, steps, "cascade")
+    return maximise(model, records, [*learnt, *starts], steps=steps, key="cascade", **options)

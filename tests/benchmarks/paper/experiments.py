@@ -147,7 +147,7 @@ EXPERIMENTS = {
     ),
     "circuit": Experiment(
         "Wiener-Hammerstein with process noise", _circuit, (5, "static", 5), (True, False),
-        seconds=1200.0, seeds=(0,), follows=False, test_process_noise=False, unit="V",
+        seconds=600.0, seeds=(0,), follows=False, test_process_noise=False, unit="V",
         targets={"rmse": 0.020, "crps": 0.012, "rmse swept sine": 0.021},
         paper={"rmse": (0.029, 0.034, 0.120), "mae": (0.024, 0.028, 0.096),
                "crps": (0.016, np.nan, 0.077)},
@@ -155,18 +155,18 @@ EXPERIMENTS = {
         "benchmark's authors say, and in the test not at all.",
     ),
     "drives_1": Experiment(
-        "coupled drives, first record", _drives(1), (5, "static", 5), (True, True), seconds=180.0,
+        "coupled drives, first record", _drives(1), (5, "static", 5), (True, True), seconds=120.0,
         seeds=(0, 1, 2), skip=4, unit="V", targets={"rmse": 0.097},
     ),
     "drives_2": Experiment(
-        "coupled drives, second record", _drives(2), (5, "static", 5), (True, True), seconds=180.0,
+        "coupled drives, second record", _drives(2), (5, "static", 5), (True, True), seconds=120.0,
         seeds=(0, 1, 2), skip=4, unit="V", targets={"rmse": 0.085, "crps": 0.055},
         paper={"rmse": (0.147, 0.105, 0.247), "mae": (0.109, 0.075, 0.174),
                "crps": (0.081, np.nan, 0.132)},
     ),
     "electricity": Experiment(
         "electricity demand", _electricity, (5, "static", 5), (False, False),
-        seconds=1800.0, seeds=(0,), width=3, unit="MW",
+        seconds=600.0, seeds=(0,), width=3, unit="MW",
         targets={"rmse": 291.0, "mae": 215.0, "crps": 197.0},
         paper={"rmse": (291.0, 297.0, 376.0), "mae": (215.0, 235.0, 273.0),
                "crps": (197.0, np.nan, 258.0)},
