@@ -1,0 +1,87 @@
+"""What every effect has: names, how it is found, which blocks add it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+
+from pyro_dynogp.channels.base import signal_of
+from pyro_dynogp.discrepancy.evidence import Evidence, Residuals
+from pyro_dynogp.discrepancy.extend import Model
+from pyro_dynogp.discrepancy.trials import Score
+from pyro_dynogp.record import Record
+
+# Share of its estimate by which a limit or a width may be off, tried by refits, and then finer.
+AROUND = (0.75, 1.0, 1.3)
+FINER = ((0.88, 1.13), (0.95, 1.05))
+
+
+class Effect:
+    """Something that a model may lack.
+
+    Attributes:
+        name: of the effect. family: those that one cause may set off together.
+        freedom: how much it leaves open; of two that explain the same, the one with less is kept.
+        localised: whether it happens at one instant, so that refits are scored on blocks of the
+            whole record rather than after it.
+        score: on which densities it must pay: of forecasts, or one step ahead.
+        once: whether it is not looked for again in a model that has it.
+        added: whether a block mends it; False for what is only reported.
+        test: finds evidence in residuals; a class whose test needs more overrides `detect`.
+    """
+
+    name: ClassVar[str] = ""
+    family: ClassVar[str] = ""
+    freedom: ClassVar[int] = 1
+    localised: ClassVar[bool] = False
+    score: ClassVar[Score] = "forecast"
+    once: ClassVar[bool] = False
+    added: ClassVar[bool] = True
+    test: ClassVar[Callable[..., Evidence | Sequence[Evidence]]]
+
+    def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
+        """Evidence for the effect, one for each channel it may come from; may be empty."""
+        return listed(self.test(residuals, seed=seed))
+
+    def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
+        """Variants of the model with the effect as a block; empty where it is only reported."""
+        raise NotImplementedError
+
+    def refine(self, model: Model, times: int) -> Sequence[Model]:
+        """Variants close to the best one so far, closer each time; none by default."""
+        return []
+
+    def sentence(self, evidence: Evidence, model: Model) -> str:
+        """What it is, once the model has it; what the test said by default."""
+        return evidence.sentence
+
+
+def listed(found: Evidence | Sequence[Evidence]) -> Sequence[Evidence]:
+    """What a test found, as a sequence."""
+    return [found] if isinstance(found, Evidence) else found
+
+
+def number_of(evidence: Evidence, key: str) -> float:
+    """A number that names the effect: a delay, a limit, a frequency."""
+    return float(evidence.where[key])
+
+
+def unit_of(evidence: Evidence) -> str:
+    """Time unit of the record, after a number."""
+    unit = str(evidence.where.get("time_unit", ""))
+    return f" {unit}" if unit else ""
+
+
+def centre_of(record: Record, name: str) -> float:
+    """Mean of a channel [its unit]."""
+    return float(np.mean(signal_of(record, name)))
+
+
+def finer(model: Model, number: str, times: int) -> list[Model]:
+    """The model with a number of its last channel a little smaller and larger."""
+    *rest, last = model.channels
+    values = [share * getattr(last, number) for share in FINER[times]]
+    return [replace(model, channels=(*rest, replace(last, **{number: v}))) for v in values]

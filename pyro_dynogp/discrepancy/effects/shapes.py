@@ -1,0 +1,112 @@
+"""Effects that are functions: static ones at either end, and play."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from pyro_dynogp.channels import DeadZone, Play
+from pyro_dynogp.discrepancy.effects.base import AROUND, FINER, Effect, finer, number_of
+from pyro_dynogp.discrepancy.evidence import Evidence
+from pyro_dynogp.discrepancy.extend import (
+    Model,
+    with_channel,
+    with_input_function,
+    with_output_function,
+)
+from pyro_dynogp.discrepancy.shape_effects import (
+    dead_zone,
+    hysteresis,
+    input_nonlinearity,
+    output_nonlinearity,
+    saturation,
+)
+from pyro_dynogp.record import Record
+
+
+class OutputNonlinearity(Effect):
+    """A function of the model's output: a sensor that is not linear."""
+
+    name = "output nonlinearity"
+    family = "shapes"
+    freedom = 4
+    test = staticmethod(output_nonlinearity)
+
+    def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
+        """A static layer after the last dynamic one."""
+        extended = with_output_function(model)
+        return [] if extended is None else [extended]
+
+
+class Saturation(OutputNonlinearity):
+    """A sensor that clips."""
+
+    name = "saturation"
+    family = "shapes"
+    freedom = 1
+    test = staticmethod(saturation)
+
+
+class InputNonlinearity(Effect):
+    """A function of an input: an actuator that is not linear."""
+
+    name = "input nonlinearity"
+    family = "shapes"
+    freedom = 4
+    test = staticmethod(input_nonlinearity)
+
+    def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
+        """A static layer before the first dynamic one."""
+        extended = with_input_function(model)
+        return [] if extended is None else [extended]
+
+
+class DeadZoneOfInput(Effect):
+    """An actuator that does nothing around the middle."""
+
+    name = "dead zone"
+    family = "shapes"
+    freedom = 2
+    test = staticmethod(dead_zone)
+
+    def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
+        """The input beyond limits around the estimate."""
+        channel = str(evidence.where["channel"])
+        low, high = number_of(evidence, "low"), number_of(evidence, "high")
+        middle, half = 0.5 * (low + high), 0.5 * (high - low)
+        return [
+            with_channel(model, DeadZone(channel, middle - share * half, middle + share * half))
+            for share in AROUND
+        ]
+
+    def refine(self, model: Model, times: int) -> Sequence[Model]:
+        """Each limit a little lower and higher."""
+        last = model.channels[-1]
+        assert isinstance(last, DeadZone)
+        width = last.high - last.low
+        finer = [
+            replace(last, **{limit: getattr(last, limit) + (share - 1.0) * width})
+            for share in FINER[times]
+            for limit in ("low", "high")
+        ]
+        return [replace(model, channels=(*model.channels[:-1], one)) for one in finer]
+
+
+class Hysteresis(Effect):
+    """Mechanical play of an actuator."""
+
+    name = "hysteresis"
+    family = "shapes"
+    freedom = 2
+    test = staticmethod(hysteresis)
+
+    def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
+        """The input behind play of widths around the estimate; play of a sensor is reported."""
+        channel, width = str(evidence.where["channel"]), number_of(evidence, "width")
+        if channel in record.output_names:
+            return []
+        return [with_channel(model, Play(channel, share * width)) for share in AROUND]
+
+    def refine(self, model: Model, times: int) -> Sequence[Model]:
+        """The play a little narrower and wider."""
+        return finer(model, "width", times)

@@ -1,0 +1,197 @@
+"""Effects that go with time: drifts, steps, periods, calendars, clocks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from pyro_dynogp.channels import Calendar, ShiftedClock, Sinusoid, Step, Trend, TrendOfGain
+from pyro_dynogp.channels.clock import DAY
+from pyro_dynogp.discrepancy.calendar_effects import calendar
+from pyro_dynogp.discrepancy.clock_effects import clock_shift
+from pyro_dynogp.discrepancy.effects.base import Effect, centre_of, listed, number_of
+from pyro_dynogp.discrepancy.evidence import Curve, Evidence, Residuals
+from pyro_dynogp.discrepancy.extend import (
+    Model,
+    with_channel,
+    with_pairs,
+    with_process_noise,
+    without_channel,
+)
+from pyro_dynogp.discrepancy.periodic import periodic_disturbance
+from pyro_dynogp.discrepancy.time_effects import drift, level_shift
+from pyro_dynogp.record import Record
+
+# One zone for each common rule of daylight saving: clocks tell zones apart by their transitions.
+ZONES = (
+    "UTC", "Europe/Berlin", "America/New_York", "America/Santiago", "Australia/Melbourne",
+    "Pacific/Auckland",
+)  # fmt: skip
+# Parts of the calendar under the names of the channel that stands for them.
+CALENDAR_PARTS = {
+    "hour of day by weekday/weekend": "hour of day by weekend",
+    "season": "time of year",
+}
+# Share of a drift's variance from which it counts as a straight line.
+STRAIGHT = 0.95
+
+
+class Drift(Effect):
+    """A level, or a gain, that changes slowly."""
+
+    name = "drift"
+    family = "time"
+    test = staticmethod(drift)
+
+    def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
+        """A straight line in time or, where it bends, a random path; or each input times a line.
+
+        The random path is a pair of poles, as slow as suits it, that process noise drives: a line
+        through a bend would go on to where nothing is.
+        """
+        begin, end = float(record.time[0]), float(record.time[-1])
+        if evidence.where["form"] == "additive":
+            if evidence.curve is not None and _straightness(evidence.curve) < STRAIGHT:
+                return [with_process_noise(with_pairs(model, 1))]
+            return [with_channel(model, Trend(begin, end))]
+        extended = model
+        prepared = model.check(record)[0]
+        driving = prepared.n_inputs - model.direct
+        for name in prepared.input_names[:driving]:
+            extended = with_channel(
+                extended, TrendOfGain(name, centre_of(prepared, name), begin, end)
+            )
+        return [extended]
+
+
+def _straightness(curve: Curve) -> float:
+    """Share of a curve's variance that a straight line has."""
+    there = np.isfinite(curve.x) & np.isfinite(curve.fitted)
+    x, y = curve.x[there], curve.fitted[there]
+    if len(x) < 3 or not np.std(y) or not np.std(x):
+        return 1.0
+    return float(np.corrcoef(x, y)[0, 1] ** 2)
+
+
+class LevelShift(Effect):
+    """A level that jumps at one instant."""
+
+    name = "level shift"
+    family = "time"
+    localised = True
+    test = staticmethod(level_shift)
+
+    def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
+        """A step at the instant."""
+        return [with_channel(model, Step(number_of(evidence, "time")))]
+
+
+class PeriodicDisturbance(Effect):
+    """A line that no input explains."""
+
+    name = "periodic disturbance"
+    family = "time"
+    test = staticmethod(periodic_disturbance)
+
+    def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
+        """A sinusoid of the period, and of periods within its resolution."""
+        period = number_of(evidence, "period")
+        width = period**2 / record.duration
+        return [
+            with_channel(model, Sinusoid(period + share * width, 1))
+            for share in (-0.2, -0.1, 0.0, 0.1, 0.2)
+        ] + [with_channel(model, Sinusoid(period, 3))]
+
+
+class CalendarEffect(Effect):
+    """Hours, weekdays or seasons, for records with time stamps.
+
+    Args:
+        zones: IANA zones on whose clocks the calendar may run, beside that of the stamps.
+    """
+
+    name = "calendar"
+    family = "time"
+    freedom = 3
+
+    def __init__(self, zones: Sequence[str] = ZONES) -> None:
+        self.zones = tuple(zones)
+
+    def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
+        """One for each part of the calendar."""
+        if residuals.stamps is None:
+            return []
+        return listed(calendar(residuals, zones=self.zones, seed=seed))
+
+    def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
+        """The part of the calendar as direct inputs; or all that the model has, on that clock.
+
+        In place of the same part, if the model has it: with twice the harmonics if on that clock.
+        """
+        what, zone = str(evidence.where["what"]), str(evidence.where["zone"])
+        part = CALENDAR_PARTS.get(what, what)
+        there = [one for one in model.channels if isinstance(one, Calendar)]
+        harmonics, plain = 3 if part == "time of year" else 6, model
+        for one in there:
+            if one.what == part:
+                plain = without_channel(plain, one)
+                harmonics = max(harmonics, one.harmonics * (2 if one.zone == zone else 1))
+        variants = [with_channel(plain, Calendar(part, zone, harmonics))]
+        if any(one.zone != zone for one in there):
+            channels = tuple(
+                replace(c, zone=zone) if isinstance(c, Calendar) else c for c in model.channels
+            )
+            variants.append(replace(model, channels=channels))
+        return variants
+
+
+class ClockShift(Effect):
+    """An input whose clock is off in part of the record.
+
+    Args:
+        zones: IANA zones whose daylight saving may be what shifts it, for records with stamps.
+    """
+
+    name = "clock shift"
+    family = "time"
+    localised = True
+
+    def __init__(self, zones: Sequence[str] = ZONES) -> None:
+        self.zones = tuple(zones)
+
+    def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
+        """One for each input."""
+        zones = () if residuals.stamps is None else self.zones
+        return listed(clock_shift(residuals, zones=zones, seed=seed))
+
+    def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
+        """The input, and all inputs, read at other times from the instant on."""
+        channel, shift = str(evidence.where["channel"]), number_of(evidence, "shift")
+        times: tuple[float, ...] = (number_of(evidence, "time"),)
+        if "rule" in evidence.where:
+            times = summers(record, str(evidence.where["rule"]))
+        together = model
+        prepared = model.check(record)[0]
+        for name in prepared.input_names[: prepared.n_inputs - model.direct]:
+            together = with_channel(together, ShiftedClock(name, shift, times))
+        alone = with_channel(model, ShiftedClock(channel, shift, times))
+        return [alone] if together == alone else [alone, together]
+
+
+def summers(record: Record, zone: str) -> tuple[float, ...]:
+    """Times at which a zone's daylight saving begins and, in turn, ends, over a record and a year.
+
+    Begins with the beginning of a summer, which may lie before the record.
+    """
+    assert record.start is not None
+    first = record.start + pd.Timedelta(record.time[0] - 366 * DAY, "s")
+    hours = pd.date_range(first, periods=24 * int(record.duration / DAY + 2 * 366), freq="h")
+    saving = np.array([bool(stamp.dst()) for stamp in hours.tz_convert(zone).to_pydatetime()])
+    changes = np.flatnonzero(np.diff(saving.astype(int))) + 1
+    if len(changes) and not saving[changes[0]]:
+        changes = changes[1:]
+    seconds = np.asarray((hours - record.start).total_seconds())
+    return tuple(float(seconds[k]) for k in changes)
