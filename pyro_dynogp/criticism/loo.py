@@ -61,7 +61,8 @@ def loo(
             seen the data: O(n) and quick, and kind to models of many parameters. For records so
             long that parameters are all but known.
         refits: most fits that are made again where Pareto's k is above ArviZ's good_k
-            ("new record" makes one for each fold whatever this says).
+            (of forecasts above 0.5, because their errors are of one sign and add up; "new record"
+            makes one for each fold whatever this says).
         seed: for the draws. workers: processes for refits. progress: whether to show a bar.
 
     Returns:

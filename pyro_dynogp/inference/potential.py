@@ -109,9 +109,12 @@ class Potential:
         return sum(site.unconstrained.numel() for site in self.sites)
 
     def pack(self, values: Mapping[str, Tensor]) -> Tensor:
-        """Constrained values of every site to the unconstrained vector (d,)."""
+        """Constrained values of every site to the unconstrained vector (d,), finite.
+
+        A mode may lie on a boundary to the last digit, where the vector would be infinite.
+        """
         parts = [site.transform.inv(values[site.name]).reshape(-1) for site in self.sites]
-        return torch.cat(parts).detach()
+        return torch.cat(parts).detach().nan_to_num(nan=math.nan, posinf=EDGE, neginf=-EDGE)
 
     def unpack(self, z: Tensor) -> dict[str, Tensor]:
         """Unconstrained vectors (*s, d) to constrained values (*s, *shape) of every site."""
@@ -196,6 +199,8 @@ class Potential:
 
 
 _WALL = 1e15
+# Unconstrained value of what lies on a boundary: within 1e-13 of it.
+EDGE = 30.0
 
 
 def laplace_root(hessian: np.ndarray, *, widest: float) -> np.ndarray:

@@ -310,7 +310,6 @@ class Cascade:
             feedthrough=layer.feedthrough,
             process_noise=layer.process_noise,
             time_scale=time_scale,
-            gain_scale=GAIN_SCALE,
             priors=self.priors,
         )
         return DynamicSystem(modes, past_input_covariance(modes, 1.0 / time_scale.typical_rate))
@@ -414,9 +413,6 @@ class Cascade:
         return value if several else value.unsqueeze(-1)
 
 
-# Prior standard deviation of a layer's gains. Layers have unit scale; wider priors let pairs with
-# large gains cancel each other within the record and part after it.
-GAIN_SCALE = 1.0
 # Least variance of the conditional of a static layer's value (scaled units): its density is finite
 # where a sample lies on an inducing location.
 TINY = 1e-10

@@ -27,6 +27,7 @@ from torch import Tensor
 
 from pyro_dynogp._errors import invalid
 from pyro_dynogp.distributions.decay import LogDecayRate
+from pyro_dynogp.distributions.shared_scale import SharedScaleNormal
 from pyro_dynogp.lti.modes import Modes, NoiseStructure
 from pyro_dynogp.scaling import Scaling
 
@@ -34,6 +35,8 @@ PriorName = Literal["default", "paper"]
 
 # Scale of the horseshoe on the noise gains (paper, appendix "Implementation").
 HORSESHOE_SCALE = 0.1
+# Gains of a pair for an input of unit size, a priori, and the degrees of freedom of that size.
+GAIN_SCALE, GAIN_FREEDOM = 0.3, 3.0
 # Least ratio of frequency to decay rate of a pair.
 CRITICAL = 0.02
 # Decay rates below this many per record are unlikely a priori: in 1/SETTLING of the record such a
@@ -158,7 +161,7 @@ def sample_modes(
     feedthrough: bool = True,
     process_noise: bool = True,
     time_scale: TimeScale | None = None,
-    gain_scale: float = 3.0,
+    gain_scale: float = GAIN_SCALE,
     priors: PriorName = "default",
 ) -> Modes:
     """Sample a stochastic LTI system, for inputs and outputs of unit standard deviation.
@@ -166,8 +169,10 @@ def sample_modes(
     Sites (all start with ``<name>_``), * marking what depends on the options:
 
     - ``log_decay``, ``log_frequency`` (P,): see `sample_poles`.
-    - ``input_gain`` (P, n_u, 2)*: g1 and g0 of each section (output per input), normal(0,
-      gain_scale).
+    - ``input_gain`` (P, n_u, 2)*: g1 and g0 of each section (output per input). Those of one
+      input are normal around zero with a size of their own, unknown (`SharedScaleNormal`): pairs
+      that are not needed shrink, as do inputs that have no effect; a slow pair may have gains of
+      ten.
     - ``output_gain`` (n_y, P, 2)*: direction of c, only for several outputs; normal(0, 1).
     - ``noise_gain_local_scale`` (P,), ``noise_gain_unit`` (P, n_l, 2)*: horseshoe of scale 0.1 on
       n1 and n0 of the noise's sections (n1 s + n0 |lambda|) sqrt(4 r) / (...), r the typical rate
@@ -187,7 +192,7 @@ def sample_modes(
         process_noise: whether there is process noise at all.
         time_scale: step and duration of the record [s]; by default time is counted in samples of
             a record of 1000.
-        gain_scale: standard deviation of the gains a priori.
+        gain_scale: of the gains of an input a priori.
         priors: "default", or "paper" for flat ones but for the horseshoe.
 
     Returns:
@@ -200,9 +205,7 @@ def sample_modes(
     flat = priors == "paper"
     B = L = D = None
     if inputs:
-        gain = pyro.sample(
-            f"{name}_input_gain", _normal(FLAT if flat else gain_scale, pairs, inputs, 2)
-        )
+        gain = _input_gain(f"{name}_input_gain", pairs, inputs, None if flat else gain_scale)
         B = residues(poles, _section(poles, gain) * poles.abs()[..., None, None])
         if feedthrough:
             shape = (inputs,) if outputs is None else (outputs, inputs)
@@ -224,6 +227,13 @@ def sample_modes(
 def sample_direct(columns: int, outputs: int, *, flat: bool = False) -> Tensor:
     """Weights (*b, n_y, K) of inputs that act on the output at once, site ``direct``."""
     return pyro.sample("direct", _normal(FLAT if flat else 1.0, outputs, columns))
+
+
+def _input_gain(name: str, pairs: int, inputs: int, scale: float | None) -> Tensor:
+    """Gains (*b, P, n_u, 2) of all sections; flat without a scale."""
+    if scale is None:
+        return pyro.sample(name, _normal(FLAT, pairs, inputs, 2))
+    return pyro.sample(name, SharedScaleNormal(GAIN_FREEDOM, scale, (pairs, inputs, 2), apart=1))
 
 
 def _section(poles: Tensor, gain: Tensor) -> Tensor:

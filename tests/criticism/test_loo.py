@@ -169,15 +169,15 @@ def test_a_smooth_signal_is_easier_to_fill_in_than_to_forecast(one_pair):
 
 def test_forecasts_with_refits_against_fits_to_the_past(linear, short):
     """Ratios and refits backwards, against a fit to the past alone of two forecasts."""
-    found = dgp.loo(linear, target="forecast", begin=50, draws=250, **QUIET)
+    found = dgp.loo(linear, target="forecast", begin=30, draws=250, **QUIET)
     subject = FitSubject(linear, linear.records, 250, 0)
     assert found["not_refitted"] == 0
     assert found["refits"] > 0
-    for i in range(50, 60, 5):
+    for i in (30, 45, 50):
         other = subject.without(np.arange(60) >= i)
         density = other.pointwise("forecast")[:, i]
         exact = float(logsumexp(arviz_bridge.psis(other.draws.log_ratio)[0] + density))
-        assert float(found.loo_i[i - 50]) == pytest.approx(exact, abs=0.15)
+        assert float(found.loo_i[i - 30]) == pytest.approx(exact, abs=0.15)
 
 
 def test_at_the_mode(linear, short, left_out):

@@ -38,6 +38,18 @@ def test_pack_and_unpack_are_inverse(potential):
         torch.testing.assert_close(again[name], value, rtol=1e-10, atol=1e-12)
 
 
+def test_a_value_on_a_boundary_has_a_finite_vector_next_to_it(potential):
+    function, values = potential
+    (frequency,) = (site for site in function.sites if site.name == "g_log_frequency")
+    top = frequency.transform(torch.full_like(values["g_log_frequency"], 100.0))
+    z = function.pack({**values, "g_log_frequency": top})
+    assert torch.isfinite(z).all()
+    torch.testing.assert_close(function.unpack(z)["g_log_frequency"], top, rtol=0.0, atol=1e-11)
+    centre, root = function.laplace({**values, "g_log_frequency": top}, widest=3.0)
+    assert np.isfinite(centre).all()
+    assert np.isfinite(root).all()
+
+
 def test_energy_is_the_trace_of_the_model(potential, record):
     function, values = potential
     conditioned = pyro.poutine.condition(function.model, data=values)
