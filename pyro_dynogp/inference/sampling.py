@@ -118,8 +118,9 @@ def sample_posterior(
 ) -> Chains:
     """Run NUTS from around the posterior mode `values`.
 
-    Coordinates are whitened by the Laplace approximation at the mode; each chain starts at a
-    draw from it.
+    Coordinates are whitened by the Laplace approximation at the mode, and by a dense mass matrix
+    that warm-up adapts; each chain starts at a draw of that approximation, or between it and the
+    mode (`within_reach`).
     """
     potential = Potential(model, (records,), values)
     z, root = potential.laplace(values, widest=3.0)
