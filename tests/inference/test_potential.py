@@ -152,5 +152,4 @@ def test_evidence_prefers_a_broad_hill_to_a_needle():
     assert found["needle"][0] > found["hill"][0] + 2.0
     # Both hills stand where the prior is equal: shares of the mass are the weights.
     difference = found["hill"][1] - found["needle"][1]
-    print("DIFF", difference, np.log(49.0))
     assert difference == pytest.approx(np.log(49.0), abs=0.05)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import ClassVar
 
 from pyro_dynogp.channels import DeadZone, Play
 from pyro_dynogp.discrepancy.effects.base import AROUND, FINER, Effect, finer, number_of
@@ -24,41 +25,45 @@ from pyro_dynogp.discrepancy.shape_effects import (
 from pyro_dynogp.record import Record
 
 
-class OutputNonlinearity(Effect):
+class Nonlinearity(Effect):
+    """A static function at one end of the model.
+
+    Attributes:
+        add: the model with that function, None where it has one.
+    """
+
+    family = "shapes"
+    freedom = 4
+    add: ClassVar[Callable[..., Model | None]]
+
+    def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
+        """A static layer at that end."""
+        extended = self.add(model)
+        return [] if extended is None else [extended]
+
+
+class OutputNonlinearity(Nonlinearity):
     """A function of the model's output: a sensor that is not linear."""
 
     name = "output nonlinearity"
-    family = "shapes"
-    freedom = 4
     test = staticmethod(output_nonlinearity)
-
-    def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
-        """A static layer after the last dynamic one."""
-        extended = with_output_function(model)
-        return [] if extended is None else [extended]
+    add = staticmethod(with_output_function)
 
 
 class Saturation(OutputNonlinearity):
     """A sensor that clips."""
 
     name = "saturation"
-    family = "shapes"
     freedom = 1
     test = staticmethod(saturation)
 
 
-class InputNonlinearity(Effect):
+class InputNonlinearity(Nonlinearity):
     """A function of an input: an actuator that is not linear."""
 
     name = "input nonlinearity"
-    family = "shapes"
-    freedom = 4
     test = staticmethod(input_nonlinearity)
-
-    def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
-        """A static layer before the first dynamic one."""
-        extended = with_input_function(model)
-        return [] if extended is None else [extended]
+    add = staticmethod(with_input_function)
 
 
 class DeadZoneOfInput(Effect):
@@ -84,12 +89,12 @@ class DeadZoneOfInput(Effect):
         last = model.channels[-1]
         assert isinstance(last, DeadZone)
         width = last.high - last.low
-        finer = [
+        moved = [
             replace(last, **{limit: getattr(last, limit) + (share - 1.0) * width})
             for share in FINER[times]
             for limit in ("low", "high")
         ]
-        return [replace(model, channels=(*model.channels[:-1], one)) for one in finer]
+        return [replace(model, channels=(*model.channels[:-1], one)) for one in moved]
 
 
 class Hysteresis(Effect):
