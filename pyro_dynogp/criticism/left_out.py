@@ -15,17 +15,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.special import logsumexp
-from tqdm import tqdm
+from tqdm import trange
 
 from pyro_dynogp._errors import invalid
 from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.subjects import Subject
 from pyro_dynogp.parallel import parallel_map
-
-# Pareto's k above which forecasts are made from a new fit. Below ArviZ's limit single ratios can be
-# trusted, but what they lack is of one sign here (weights that should have gone back further), and
-# adds up over the forecasts between two fits: 0.15 to 0.25 nats each in a tested case.
-FORECAST_K = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +146,11 @@ def _one_left_out(subject: Subject, i: int, N: int) -> float:
 def forecast(
     subject: Subject, horizon: int, begin: int | float, most: int, progress: bool
 ) -> Found:
-    """Backwards through the record: ratios leave out ever more of the end, until a refit."""
+    """Forwards through the record: ratios take in what came since the last fit, until a refit.
+
+    Draws given less data are wider than what they stand for, and have not seen what is forecast.
+    Where no refit is allowed, ratios take the future out of the draws given all data instead.
+    """
     places = subject.places
     if len(np.unique(places["record"])) > 1:
         raise invalid(
@@ -170,8 +169,6 @@ def forecast(
         )  # fmt: skip
     step, target = _both(subject, horizon)
     base = Base.of(subject)
-    log_ratio, ancestor = base.log_ratio, base.ancestor
-    good = arviz_bridge.good_k(len(log_ratio))
     found = Found(base, scored, np.zeros(len(scored)), np.zeros(len(scored)), 0.0, 0.0)
     _note(found, subject)
     whole = base.log_weights
@@ -180,33 +177,31 @@ def forecast(
     if len(whole) == 1:  # one draw weighs what it weighs, whatever is left out
         found.elpd = target[0, scored]
         return found
+    good = arviz_bridge.good_k(len(whole))
     shares: list[np.ndarray] = []  # influences on forecasts since the last refit
     errors: list[float] = []
+    current = base
     end = len(sample)  # data before this one are in the current fit
-    bar = tqdm(total=len(scored), desc="forecasts", disable=not progress)
-    for place in range(len(scored) - 1, -1, -1):
+    for place in trange(len(scored), desc="forecasts", disable=not progress):
         i = int(scored[place])
         # Outputs of one time follow one another at horizon 1; further ahead whole times do.
         known = i if horizon == 1 else int(np.searchsorted(sample, sample[i] - horizon + 1))
-        log_weights, k = _given(log_ratio, step, known, end)
-        if k > min(good, FORECAST_K) and found.refits < most:
-            current = subject.without(np.arange(len(sample)) >= known)
-            found.refits += 1
+        log_weights, k = _given(current, step, known, end)
+        if found.refits < most and (k > good or end > known):
             if shares:  # other draws from here on
-                errors.append(spread_of(np.sum(shares, axis=0), ancestor))
+                errors.append(spread_of(np.sum(shares, axis=0), current.ancestor))
                 shares = []
-            step, target = _both(current, horizon)
-            again = Base.of(current)
-            log_ratio, ancestor, end = again.log_ratio, again.ancestor, known
-            log_weights, k = _given(log_ratio, step, known, end)
-        elif k > good:
+            past = subject.without(np.arange(len(sample)) >= known)
+            step, target = _both(past, horizon)
+            current, end = Base.of(past), known
+            found.refits += 1
+            log_weights, k = _given(current, step, known, end)
+        if k > good:
             found.left += 1
         found.k[place] = k
         found.elpd[place] = logsumexp(log_weights + target[:, i])
         shares.append(np.exp(log_weights + target[:, i] - found.elpd[place]) - np.exp(log_weights))
-        bar.update()
-    bar.close()
-    errors.append(spread_of(np.sum(shares, axis=0), ancestor))
+    errors.append(spread_of(np.sum(shares, axis=0), current.ancestor))
     found.error = float(np.sqrt(np.square(errors).sum()))
     return found
 
@@ -217,11 +212,16 @@ def _both(subject: Subject, horizon: int) -> tuple[np.ndarray, np.ndarray]:
     return step, step if horizon == 1 else subject.pointwise("forecast", horizon)
 
 
-def _given(
-    log_ratio: np.ndarray, step: np.ndarray, known: int, end: int
-) -> tuple[np.ndarray, float]:
-    """Weights (S,) for the posterior given the first `known` samples, and Pareto's k."""
-    log_weights, k = arviz_bridge.psis(log_ratio - step[:, known:end].sum(1))
+def _given(base: Base, step: np.ndarray, known: int, end: int) -> tuple[np.ndarray, float]:
+    """Weights (S,) for the posterior given the first `known` samples, and Pareto's k.
+
+    Draws are of a fit to the first `end` samples.
+    """
+    if known >= end:
+        ratio = base.log_ratio + step[:, end:known].sum(1)
+    else:
+        ratio = base.log_ratio - step[:, known:end].sum(1)
+    log_weights, k = arviz_bridge.psis(ratio)
     return log_weights, float(k)
 
 

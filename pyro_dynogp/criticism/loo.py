@@ -60,9 +60,10 @@ def loo(
         parameters: "posterior", or "mode" for densities with all parameters at the mode, which has
             seen the data: O(n) and quick, and kind to models of many parameters. For records so
             long that parameters are all but known.
-        refits: most fits that are made again where Pareto's k is above ArviZ's good_k
-            (of forecasts above 0.5, because their errors are of one sign and add up; "new record"
-            makes one for each fold whatever this says).
+        refits: most fits that are made again where Pareto's k is above ArviZ's good_k. Forecasts
+            begin with a fit to the past of the first one, and go on from it by ratios that take in
+            what came since; 0 has them take the future out of the draws given all data instead,
+            which flatters. "new record" makes one for each fold whatever this says.
         seed: for the draws. workers: processes for refits. progress: whether to show a bar.
 
     Returns:

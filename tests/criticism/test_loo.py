@@ -168,16 +168,25 @@ def test_a_smooth_signal_is_easier_to_fill_in_than_to_forecast(one_pair):
 
 
 def test_forecasts_with_refits_against_fits_to_the_past(linear, short):
-    """Ratios and refits backwards, against fits to the past alone of four forecasts."""
+    """Ratios and refits forwards, against fits to the past alone of four forecasts."""
     found = dgp.loo(linear, target="forecast", begin=30, draws=250, **QUIET)
     subject = FitSubject(linear, linear.records, 250, 0)
     assert found["not_refitted"] == 0
-    assert found["refits"] > 0
+    assert 1 < found["refits"] < 15
     for i in (30, 45, 50, 55):
         other = subject.without(np.arange(60) >= i)
         density = other.pointwise("forecast")[:, i]
         exact = float(logsumexp(arviz_bridge.psis(other.draws.log_ratio)[0] + density))
         assert float(found.loo_i[i - 30]) == pytest.approx(exact, abs=0.15)
+
+
+def test_forecasts_without_refits_flatter(linear):
+    """Draws that have seen the future, where no fit to the past is allowed."""
+    options = {"target": "forecast", "begin": 30, "draws": 250, **QUIET}
+    forwards, backwards = (dgp.loo(linear, refits=many, **options) for many in (30, 0))
+    assert backwards["refits"] == 0
+    assert backwards["not_refitted"] > 0
+    assert backwards.elpd_loo > forwards.elpd_loo + 1.0
 
 
 def test_at_the_mode(linear, short, left_out):
