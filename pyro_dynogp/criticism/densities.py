@@ -18,7 +18,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from scipy.special import logsumexp
 from torch import Tensor
 
 from pyro_dynogp._errors import invalid
@@ -98,26 +97,16 @@ def _cascade(observed: ObservedCascade, y: Tensor, kind: Kind, horizon: int) -> 
     layout = problem.layout
     elements, _ = problem.elements()
 
-    def moments(b: int) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and variance (n, n_y) of the noise-free outputs."""
+    def density(b: int) -> np.ndarray:
         values = elements[b]
         if kind == "missing sample":
             _, means, covariances, _, _ = recursion.run(layout, values)
-            return smoothing.leave_one_out(layout, values, means, covariances)
-        if horizon == 1:
-            innovation, total = smoothing.innovate(layout, values)
-            return values.y - innovation, total - values.R
-        return smoothing.predict_ahead(layout, values, horizon)
-
-    def density(b: int) -> np.ndarray:
-        values = elements[b]
-        mean, variance = moments(b)
-        # The noise is a mixture of normals: one, or those that make up a Student-t.
-        total = variance[..., None] + values.R[..., None] * layout.multiple
-        terms = np.log(layout.share) - 0.5 * (
-            np.log(2.0 * np.pi * total) + (values.y - mean)[..., None] ** 2 / total
-        )
-        return logsumexp(terms, axis=-1)
+            found = smoothing.leave_one_out(layout, values, means, covariances)
+        elif horizon == 1:
+            found = smoothing.innovate(layout, values)
+        else:
+            found = smoothing.predict_ahead(layout, values, horizon)
+        return np.asarray(found[2])
 
     log_density = np.stack(each(density, len(elements)))
     return log_density - np.log(observed.scale.numpy())

@@ -244,6 +244,13 @@ class _Assembler:
             out[..., index[:, None], index] = self.expand(part, event)
         return out
 
+    def function_is_measured(self, output: Signal) -> bool:
+        """Whether the only output is a tabulated function of one signal."""
+        if output.rows is None or output.outputs != (self.outputs_before - 1,):
+            return False
+        last = self.blocks[-1]
+        return last.function is not None and last.channels == last.outputs == 1
+
     def finish(self, noise_sd: Tensor) -> Assembly:
         steps = self.grid.steps
         m = len(steps)
@@ -274,6 +281,7 @@ class _Assembler:
                 forms,
                 share,
                 multiple,
+                measured=self.function_is_measured(output),
             ),
             re=joined.real,
             im=joined.imag,
@@ -510,8 +518,8 @@ class ObservedCascade(TorchDistribution):
         elements, batch = problem.elements()
         found = each(lambda b: smoothing.innovate(problem.layout, elements[b]), len(elements))
         there = ~np.isnan(found[0][0])
-        r = np.stack([one[there] for one, _ in found])
-        S = np.stack([one[there] for _, one in found])
+        r = np.stack([one[0][there] for one in found])
+        S = np.stack([one[1][there] for one in found])
         return r.reshape(*batch, -1), S.reshape(*batch, -1)
 
     def sample(self, sample_shape: Any = ()) -> Tensor:

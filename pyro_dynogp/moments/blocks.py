@@ -20,6 +20,7 @@ from numba import njit
 
 from pyro_dynogp._compiled_cache import OPTIONS
 from pyro_dynogp.moments.functions import TABLE, expansion, expansion_adjoint, locate
+from pyro_dynogp.moments.measured_function import bench
 
 # Added to the variance of a layer's input: a deterministic one is a Gaussian of this variance.
 FLOOR = 1e-12
@@ -35,6 +36,8 @@ class Layout(NamedTuple):
         g_start, f_start: (S + 1,) where the layer's inputs and outputs start among all.
         nodes: (S, Q, d_max), node_weight: (S, Q), node_count: (S,).
         share, multiple: (K,) weights and variance multiples of the noise's Gaussian components.
+        measured: static layer, the last one, whose only output is the record's, a function of one
+            signal (see `measured_function`); -1 where there is none.
     """
 
     step: np.ndarray
@@ -48,6 +51,7 @@ class Layout(NamedTuple):
     node_count: np.ndarray
     share: np.ndarray
     multiple: np.ndarray
+    measured: int
 
 
 class Values(NamedTuple):
@@ -89,13 +93,16 @@ class Values(NamedTuple):
     R: np.ndarray
 
 
-class Moments(NamedTuple):
-    """What a static layer computes at one sample and its adjoint needs again; S layers of them.
+class Workspace(NamedTuple):
+    """What static layers compute at one sample and their adjoints need again; S layers of them.
 
     Attributes:
         W: (S, A, d) covariance of a with g. centre: (S, d) mean of g. root: (S, d, d) L.
         f: (S, Q, e) function at the nodes. cross: (S, d, e) sum w xi f'. gain: (S, d, e)
-        regression of f on g.
+            regression of f on g.
+        z, z_bar: (d,) a node, and the gradient by it.
+        weight4, slope4: (4,) of a table's interpolation.
+        curve, at, weights: of `measured_function`.
     """
 
     W: np.ndarray
@@ -104,18 +111,38 @@ class Moments(NamedTuple):
     f: np.ndarray
     cross: np.ndarray
     gain: np.ndarray
+    z: np.ndarray
+    z_bar: np.ndarray
+    weight4: np.ndarray
+    slope4: np.ndarray
+    curve: np.ndarray
+    at: np.ndarray
+    weights: np.ndarray
 
 
 @njit(**OPTIONS)
-def workspace(S, A, d, Q, e):
-    """Empty arrays for `Moments`."""
-    return (
+def workspace(layout, values):
+    """Work arrays for one run."""
+    S, Q, d = layout.nodes.shape
+    A = values.G.shape[1]
+    e = 1
+    for i in range(S):
+        e = max(e, layout.outputs[i])
+    curve, at, weights = bench(layout.share.shape[0])
+    return Workspace(
         np.zeros((S, A, d)),
         np.zeros((S, d)),
         np.zeros((S, d, d)),
         np.zeros((S, Q, e)),
         np.zeros((S, d, e)),
         np.zeros((S, d, e)),
+        np.empty(d),
+        np.empty(d),
+        np.empty(4),
+        np.empty(4),
+        curve,
+        at,
+        weights,
     )
 
 
@@ -134,7 +161,7 @@ def _cholesky(p, root):
 
 
 @njit(**OPTIONS)
-def append(i, time, layout, values, m, P, work, z, weight4, slope4):
+def append(i, time, layout, values, m, P, work):
     """Append the outputs of static layer i to the mean m and covariance P, in place."""
     N = values.m0.shape[0]
     d = layout.channels[i]
@@ -147,6 +174,7 @@ def append(i, time, layout, values, m, P, work, z, weight4, slope4):
     root = work.root[i]
     gain = work.gain[i]
     cross = work.cross[i]
+    z, weight4, slope4 = work.z, work.weight4, work.slope4
     for c in range(d):
         G = values.G[g0 + c]
         centre[c] = values.offset[time, g0 + c]
@@ -230,7 +258,7 @@ def append(i, time, layout, values, m, P, work, z, weight4, slope4):
 
 
 @njit(**OPTIONS)
-def append_adjoint(i, time, layout, values, bars, m, P, m_bar, P_bar, work, z, z_bar, w4, s4):
+def append_adjoint(i, time, layout, values, bars, m, P, m_bar, P_bar, work):
     """Reverse mode of `append`: m_bar and P_bar (symmetric) lose the layer's outputs, in place."""
     N = values.m0.shape[0]
     d = layout.channels[i]
@@ -241,6 +269,7 @@ def append_adjoint(i, time, layout, values, bars, m, P, m_bar, P_bar, work, z, z
     W = work.W[i]
     root = work.root[i]
     gain = work.gain[i]
+    z, z_bar, w4, s4 = work.z, work.z_bar, work.weight4, work.slope4
     cross_bar = np.empty((d, e))
     W_bar = np.zeros((na, d))
     root_bar = np.zeros((d, d))

@@ -98,8 +98,14 @@ def make_layout(
     forms: Sequence[int],
     share: np.ndarray,
     multiple: np.ndarray,
+    *,
+    measured: bool = False,
 ) -> Layout:
-    """Index arrays and quadrature nodes of the static layers, in order."""
+    """Index arrays and quadrature nodes of the static layers, in order.
+
+    Args:
+        measured: whether the last of them is what the outputs are, a function of one signal.
+    """
     sets = [gauss_hermite(d) for d in channels]
     widest = max(channels, default=1)
     most = max((len(w) for _, w in sets), default=1)
@@ -127,6 +133,7 @@ def make_layout(
         node_count=whole([len(w) for _, w in sets]),
         share=np.ascontiguousarray(share, dtype=np.float64),
         multiple=np.ascontiguousarray(multiple, dtype=np.float64),
+        measured=len(sets) - 1 if measured else -1,
     )
 
 

@@ -2,7 +2,9 @@ r"""The moment-matching filter over a record and its reverse mode, compiled; one
 
 The state x (N,) of all dynamic layers, real parts before imaginary ones, has zero mean without data
 (known inputs act through offsets). At each sample: static layers append their outputs to x; every
-measured output updates the joint Gaussian; the state moves on, x <- Phi x + gamma f + noise.
+measured output updates the joint Gaussian; the state moves on, x <- Phi x + gamma f + noise. Where
+the output is a function of one signal, the update is that of `measured_function`, and the function
+need not be appended.
 
 The noise of an output is a mixture of Gaussians of variances R multiple_k (one component: Gaussian
 noise; several: Student-t). With residual r and variance s of the noise-free output, the update is
@@ -22,7 +24,8 @@ import numpy as np
 from numba import njit
 
 from pyro_dynogp._compiled_cache import OPTIONS
-from pyro_dynogp.moments.blocks import Moments, Values, append, append_adjoint, workspace
+from pyro_dynogp.moments.blocks import FLOOR, Values, append, append_adjoint, workspace
+from pyro_dynogp.moments.measured_function import function_adjoint, function_terms
 
 SEGMENT = 64
 _LOG_2PI = math.log(2.0 * math.pi)
@@ -173,36 +176,44 @@ def enter(time, layout, values, m, P, T):
 
 
 @njit(**OPTIONS)
-def measure(time, layout, values, m, P, c):
+def seen(o, layout, values):
+    """Row (A,) of what output o is measured through: its own, or that of the function's input."""
+    if layout.measured >= 0:
+        return values.G[layout.g_start[layout.measured]]
+    return values.H[o]
+
+
+@njit(**OPTIONS)
+def output_terms(time, o, layout, values, m, P, c, work):
+    """Write the covariance c of a with what output o is measured through; l, alpha and beta."""
+    h = seen(o, layout, values)
+    covary(P, h, c)
+    y = values.y[time, o] - values.y_offset[time, o]
+    R = values.R[time, o]
+    if layout.measured >= 0:
+        centre = dot(h, m) + values.offset[time, layout.g_start[layout.measured]]
+        p = dot(h, c) + FLOOR
+        return function_terms(layout.measured, y, R, centre, p, layout, values, work)
+    return noise_terms(y - dot(h, m), dot(h, c), R, layout.share, layout.multiple)
+
+
+@njit(**OPTIONS)
+def measure(time, layout, values, m, P, c, work):
     """Use the outputs of one sample; the sum of their log-densities is returned."""
     total = 0.0
     for o in range(values.y.shape[1]):
-        y = values.y[time, o]
-        if math.isnan(y):
+        if math.isnan(values.y[time, o]):
             continue
-        h = values.H[o]
-        covary(P, h, c)
-        r = y - dot(h, m) - values.y_offset[time, o]
-        l, alpha, beta = noise_terms(r, dot(h, c), values.R[time, o], layout.share, layout.multiple)
+        l, alpha, beta = output_terms(time, o, layout, values, m, P, c, work)
         total += l
         update(P, m, c, alpha, beta)
     return total
 
 
 @njit(**OPTIONS)
-def scratch(layout, values):
-    """Work arrays for one run."""
-    N = values.m0.shape[0]
-    A = values.G.shape[1]
-    e = 1
-    for i in range(layout.outputs.shape[0]):
-        e = max(e, layout.outputs[i])
-    S = layout.channels.shape[0]
-    W, centre, root, f, cross, gain = workspace(
-        S, A, layout.nodes.shape[2], layout.nodes.shape[1], e
-    )
-    work = Moments(W, centre, root, f, cross, gain)
-    return work, np.empty((N, A)), np.empty(layout.nodes.shape[2]), np.empty(4), np.empty(4)
+def inner(layout):
+    """How many static layers the state, or an output's own row, needs."""
+    return layout.measured if layout.measured >= 0 else layout.channels.shape[0]
 
 
 @njit(**OPTIONS)
@@ -218,7 +229,8 @@ def run(layout, values):
     P = np.zeros((A, A))
     m[:N] = values.m0
     P[:N, :N] = values.P0
-    work, T, z, w4, s4 = scratch(layout, values)
+    work = workspace(layout, values)
+    T = np.empty((N, A))
     c = np.empty(A)
     total = 0.0
     for time in range(n):
@@ -226,9 +238,9 @@ def run(layout, values):
         if time % SEGMENT == 0:
             means[time // SEGMENT] = m[:N]
             covariances[time // SEGMENT] = P[:N, :N]
-        for i in range(layout.channels.shape[0]):
-            append(i, time, layout, values, m, P, work, z, w4, s4)
-        total += measure(time, layout, values, m, P, c)
+        for i in range(inner(layout)):
+            append(i, time, layout, values, m, P, work)
+        total += measure(time, layout, values, m, P, c, work)
     return total, means, covariances, m, P
 
 
@@ -311,13 +323,13 @@ def _move_adjoint(k, layout, values, bars, m, P, m_bar, P_bar, T, T_bar):
 
 
 @njit(**OPTIONS)
-def _measure_adjoint(time, layout, values, bars, m, P, m_bar, P_bar, C, alphas, betas, c_bar):
+def _measure_adjoint(time, layout, values, bars, m, P, m_bar, P_bar, C, alphas, betas, c_bar, work):
     """Reverse of `measure`: m and P go back to what they were, bars change in place."""
     A = m.shape[0]
     for o in range(values.y.shape[1] - 1, -1, -1):
         if math.isnan(values.y[time, o]):
             continue
-        h = values.H[o]
+        h = seen(o, layout, values)
         c = C[o]
         update(P, m, c, -alphas[o], -betas[o])
         covary(P_bar, c, c_bar)
@@ -325,25 +337,38 @@ def _measure_adjoint(time, layout, values, bars, m, P, m_bar, P_bar, C, alphas, 
         alpha_bar = dot(c, m_bar)
         for j in range(A):
             c_bar[j] = alphas[o] * m_bar[j] - 2.0 * betas[o] * c_bar[j]
-        r = values.y[time, o] - dot(h, m) - values.y_offset[time, o]
-        r_bar, s_bar, R_bar = noise_adjoint(
-            r,
-            dot(h, c),
-            values.R[time, o],
-            layout.share,
-            layout.multiple,
-            1.0,
-            alpha_bar,
-            beta_bar,
-        )
+        # Gradients by the mean and the variance of h'a.
+        y = values.y[time, o] - values.y_offset[time, o]
+        R = values.R[time, o]
+        if layout.measured >= 0:
+            row = layout.g_start[layout.measured]
+            centre = dot(h, m) + values.offset[time, row]
+            y_bar, R_bar, centre_bar, s_bar = function_adjoint(
+                layout.measured, y, R, centre, dot(h, c) + FLOOR, layout, values, bars, work,
+                alpha_bar, beta_bar,
+            )  # fmt: skip
+            bars.offset[time, row] += centre_bar
+            h_bar = bars.G[row]
+        else:
+            y_bar, s_bar, R_bar = noise_adjoint(
+                y - dot(h, m),
+                dot(h, c),
+                R,
+                layout.share,
+                layout.multiple,
+                1.0,
+                alpha_bar,
+                beta_bar,
+            )
+            centre_bar = -y_bar
+            h_bar = bars.H[o]
         bars.R[time, o] += R_bar
-        bars.y_offset[time, o] -= r_bar
-        bars.y[time, o] += r_bar
-        h_bar = bars.H[o]
+        bars.y_offset[time, o] -= y_bar
+        bars.y[time, o] += y_bar
         for j in range(A):
             c_bar[j] += s_bar * h[j]
-            h_bar[j] += s_bar * c[j] - r_bar * m[j]
-            m_bar[j] -= r_bar * h[j]
+            h_bar[j] += s_bar * c[j] + centre_bar * m[j]
+            m_bar[j] += centre_bar * h[j]
         for j in range(A):
             t = c_bar[j]
             hj = 0.5 * h[j]
@@ -359,14 +384,14 @@ def run_adjoint(layout, values, bars, means, covariances):
     n_y = values.y.shape[1]
     N = values.m0.shape[0]
     A = values.G.shape[1]
-    S = layout.channels.shape[0]
+    S = inner(layout)
     m = np.zeros(A)
     P = np.zeros((A, A))
     m_bar = np.zeros(A)
     P_bar = np.zeros((A, A))
-    work, T, z, w4, s4 = scratch(layout, values)
+    work = workspace(layout, values)
+    T = np.empty((N, A))
     T_bar = np.empty((N, A))
-    z_bar = np.empty(z.shape[0])
     C = np.zeros((n_y, A))
     c_bar = np.empty(A)
     alphas = np.zeros(n_y)
@@ -385,35 +410,27 @@ def run_adjoint(layout, values, bars, means, covariances):
             before_P[time - first] = P[:N, :N]
             if time < last - 1:
                 for i in range(S):
-                    append(i, time, layout, values, m, P, work, z, w4, s4)
-                measure(time, layout, values, m, P, c_bar)
+                    append(i, time, layout, values, m, P, work)
+                measure(time, layout, values, m, P, c_bar, work)
         for time in range(last - 1, first - 1, -1):
             m[:N] = before_m[time - first]
             P[:N, :N] = before_P[time - first]
             for i in range(S):
-                append(i, time, layout, values, m, P, work, z, w4, s4)
+                append(i, time, layout, values, m, P, work)
             for o in range(n_y):
-                y = values.y[time, o]
-                if math.isnan(y):
+                if math.isnan(values.y[time, o]):
                     continue
-                h = values.H[o]
-                covary(P, h, C[o])
-                r = y - dot(h, m) - values.y_offset[time, o]
-                _, alphas[o], betas[o] = noise_terms(
-                    r, dot(h, C[o]), values.R[time, o], layout.share, layout.multiple
-                )
+                _, alphas[o], betas[o] = output_terms(time, o, layout, values, m, P, C[o], work)
                 update(P, m, C[o], alphas[o], betas[o])
             if time < n - 1:
                 k = layout.step[time + 1]
                 if k >= 0:
                     _move_adjoint(k, layout, values, bars, m, P, m_bar, P_bar, T, T_bar)
             _measure_adjoint(
-                time, layout, values, bars, m, P, m_bar, P_bar, C, alphas, betas, c_bar
+                time, layout, values, bars, m, P, m_bar, P_bar, C, alphas, betas, c_bar, work
             )
             for i in range(S - 1, -1, -1):
-                append_adjoint(
-                    i, time, layout, values, bars, m, P, m_bar, P_bar, work, z, z_bar, w4, s4
-                )
+                append_adjoint(i, time, layout, values, bars, m, P, m_bar, P_bar, work)
                 start = N + layout.f_start[i]
                 for a in range(start, start + layout.outputs[i]):
                     m_bar[a] = 0.0

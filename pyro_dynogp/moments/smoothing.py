@@ -14,15 +14,18 @@ import numpy as np
 from numba import njit
 
 from pyro_dynogp._compiled_cache import OPTIONS
-from pyro_dynogp.moments.blocks import append
+from pyro_dynogp.moments.blocks import FLOOR, append, workspace
+from pyro_dynogp.moments.measured_function import function_moments, function_terms
 from pyro_dynogp.moments.recursion import (
     SEGMENT,
     covary,
     dot,
     enter,
+    inner,
     measure,
     noise_terms,
-    scratch,
+    output_terms,
+    seen,
     update,
 )
 
@@ -34,75 +37,111 @@ def _quadratic(P, h, c):
 
 
 @njit(**OPTIONS)
-def predict_ahead(layout, values, horizon):
-    """Mean and variance (n, n_y) of the noise-free outputs given data up to `horizon` before.
+def _predict(time, o, layout, values, centre, p, work, found):
+    """Write mean and variance of a noise-free output, and the log-density of the measured one.
 
-    Earlier targets than `horizon` are predicted from the first state without data.
+    centre, p: mean and variance of the filtered part of what the output is measured through.
+    """
+    offset = values.y_offset[time, o]
+    y = values.y[time, o] - offset
+    R = values.R[time, o]
+    if layout.measured >= 0:
+        i = layout.measured
+        centre += values.offset[time, layout.g_start[i]]
+        p += FLOOR
+        mean, variance = function_moments(i, centre, p, layout, values, work)
+        l, _, _ = function_terms(i, y, R, centre, p, layout, values, work)
+    else:
+        mean, variance = centre, p
+        l, _, _ = noise_terms(y - centre, p, R, layout.share, layout.multiple)
+    found[0] = mean + offset
+    found[1] = variance
+    found[2] = np.nan if math.isnan(y) else l
+
+
+@njit(**OPTIONS)
+def predict_ahead(layout, values, horizon):
+    """Of outputs given data up to `horizon` before: mean, variance, log-density (n, n_y).
+
+    Mean and variance are those of the noise-free outputs; the log-density, that of the measured
+    ones, is NaN where they are missing. Earlier targets than `horizon` are predicted from the first
+    state without data.
     """
     n = layout.step.shape[0]
     n_y = values.y.shape[1]
     N = values.m0.shape[0]
     A = values.G.shape[1]
-    S = layout.channels.shape[0]
-    mean = np.empty((n, n_y))
-    variance = np.empty((n, n_y))
+    S = inner(layout)
+    found = np.empty((3, n, n_y))
     m = np.zeros(A)
     P = np.zeros((A, A))
     m[:N] = values.m0
     P[:N, :N] = values.P0
     ahead_m = m.copy()
     ahead_P = P.copy()
-    work, T, z, w4, s4 = scratch(layout, values)
+    work = workspace(layout, values)
+    T = np.empty((N, A))
     c = np.empty(A)
     for target in range(min(horizon, n)):  # no data yet
         if target > 0:
             enter(target, layout, values, ahead_m, ahead_P, T)
         for i in range(S):
-            append(i, target, layout, values, ahead_m, ahead_P, work, z, w4, s4)
+            append(i, target, layout, values, ahead_m, ahead_P, work)
         for o in range(n_y):
-            mean[target, o] = dot(values.H[o], ahead_m) + values.y_offset[target, o]
-            variance[target, o] = _quadratic(ahead_P, values.H[o], c)
+            h = seen(o, layout, values)
+            p = _quadratic(ahead_P, h, c)
+            _predict(target, o, layout, values, dot(h, ahead_m), p, work, found[:, target, o])
     for time in range(n - horizon):
         if time > 0:
             enter(time, layout, values, m, P, T)
         for i in range(S):
-            append(i, time, layout, values, m, P, work, z, w4, s4)
-        measure(time, layout, values, m, P, c)
+            append(i, time, layout, values, m, P, work)
+        measure(time, layout, values, m, P, c, work)
         ahead_m[:] = m
         ahead_P[:] = P
         for target in range(time + 1, time + horizon + 1):
             enter(target, layout, values, ahead_m, ahead_P, T)
             for i in range(S):
-                append(i, target, layout, values, ahead_m, ahead_P, work, z, w4, s4)
+                append(i, target, layout, values, ahead_m, ahead_P, work)
         target = time + horizon
         for o in range(n_y):
-            mean[target, o] = dot(values.H[o], ahead_m) + values.y_offset[target, o]
-            variance[target, o] = _quadratic(ahead_P, values.H[o], c)
-    return mean, variance
+            h = seen(o, layout, values)
+            p = _quadratic(ahead_P, h, c)
+            _predict(target, o, layout, values, dot(h, ahead_m), p, work, found[:, target, o])
+    return found[0], found[1], found[2]
 
 
 @njit(**OPTIONS)
 def _before_outputs(time, layout, values, bar, L, work, C, alphas, betas, m, P, t, cavity):
     """Take lambda (A,) and Lambda (A, A) back over the outputs of a sample, undone in m and P.
 
-    Writes to cavity (2, n, n_y) mean and variance of each noise-free output given all data but its
-    own sample. The information of later data does not depend on what the filter knew before: with
-    q = c'Lambda c and l = c'lambda after the update, the Woodbury identity gives the mean
-    m + (l + alpha q)/(1 + beta q) and the variance s - q/(1 + beta q) before it.
+    Writes to cavity (3, n, n_y) mean and variance of each noise-free output given all data but its
+    own sample, and the sample's log-density. The information of later data does not depend on what
+    the filter knew before: with q = c'Lambda c and l = c'lambda after the update, the Woodbury
+    identity gives the mean m + (l + alpha q)/(1 + beta q) and the variance s - q/(1 + beta q)
+    before it.
     """
     A = bar.shape[0]
     for o in range(values.y.shape[1] - 1, -1, -1):
         if math.isnan(values.y[time, o]):
             continue
-        h = values.H[o]
+        h = seen(o, layout, values)
         c = C[o]
         update(P, m, c, -alphas[o], -betas[o])
         along = dot(c, bar)
         covary(L, c, t)
         q = dot(c, t)
         kept = 1.0 / (1.0 + betas[o] * q)
-        cavity[0, time, o] = dot(h, m) + values.y_offset[time, o] + kept * (along + alphas[o] * q)
-        cavity[1, time, o] = max(dot(h, c) - kept * q, 0.0)
+        _predict(
+            time,
+            o,
+            layout,
+            values,
+            dot(h, m) + kept * (along + alphas[o] * q),
+            max(dot(h, c) - kept * q, 0.0),
+            work,
+            cavity[:, time, o],
+        )
         for j in range(A):
             bar[j] += (alphas[o] - betas[o] * along) * h[j]
         both = betas[o] * (1.0 + betas[o] * q)
@@ -152,13 +191,13 @@ def smooth(layout, values, rows, means, covariances):
 
 @njit(**OPTIONS)
 def leave_one_out(layout, values, means, covariances):
-    """Mean and variance (n, n_y) of each noise-free output given all data but its own sample.
+    """What `predict_ahead` returns, of each output given all data but its own sample.
 
     NaN where the sample is missing. Exact for linear cascades with Gaussian noise.
     """
     rows = np.empty((0, values.G.shape[1]))
     _, _, cavity = _backwards(layout, values, rows, means, covariances)
-    return cavity[0], cavity[1]
+    return cavity[0], cavity[1], cavity[2]
 
 
 @njit(**OPTIONS)
@@ -173,12 +212,13 @@ def _backwards(layout, values, rows, means, covariances):
     pairs = N // 2
     mean = np.empty((n, A))
     variance = np.empty((n, rows.shape[0]))
-    cavity = np.full((2, n, n_y), np.nan)
+    cavity = np.full((3, n, n_y), np.nan)
     m = np.zeros(A)
     P = np.zeros((A, A))
     bar = np.zeros(A)
     L = np.zeros((A, A))
-    work, T, z, w4, s4 = scratch(layout, values)
+    work = workspace(layout, values)
+    T = np.empty((N, A))
     moved = np.empty((N, A))
     C = np.zeros((n_y, A))
     alphas = np.zeros(n_y)
@@ -198,22 +238,17 @@ def _backwards(layout, values, rows, means, covariances):
             before_m[time - first] = m[:N]
             before_P[time - first] = P[:N, :N]
             for i in range(S):
-                append(i, time, layout, values, m, P, work, z, w4, s4)
-            measure(time, layout, values, m, P, c)
+                append(i, time, layout, values, m, P, work)
+            measure(time, layout, values, m, P, c, work)
         for time in range(last - 1, first - 1, -1):
             m[:N] = before_m[time - first]
             P[:N, :N] = before_P[time - first]
             for i in range(S):
-                append(i, time, layout, values, m, P, work, z, w4, s4)
+                append(i, time, layout, values, m, P, work)
             for o in range(n_y):
-                y = values.y[time, o]
-                if math.isnan(y):
+                if math.isnan(values.y[time, o]):
                     continue
-                covary(P, values.H[o], C[o])
-                r = y - dot(values.H[o], m) - values.y_offset[time, o]
-                _, alphas[o], betas[o] = noise_terms(
-                    r, dot(values.H[o], C[o]), values.R[time, o], layout.share, layout.multiple
-                )
+                _, alphas[o], betas[o] = output_terms(time, o, layout, values, m, P, C[o], work)
                 update(P, m, C[o], alphas[o], betas[o])
             if time < n - 1 and layout.step[time + 1] >= 0:
                 k = layout.step[time + 1]
@@ -267,33 +302,36 @@ def _backwards(layout, values, rows, means, covariances):
 
 @njit(**OPTIONS)
 def innovate(layout, values):
-    """Innovations y - E[y] (n, n_y) and their variances, one step ahead; NaN where missing."""
+    """Innovations y - E[y], their variances and log-densities (n, n_y), one step ahead.
+
+    Outputs of one time follow one another. NaN where missing.
+    """
     n = layout.step.shape[0]
     n_y = values.y.shape[1]
     N = values.m0.shape[0]
     A = values.G.shape[1]
-    innovation = np.full((n, n_y), np.nan)
-    variance = np.full((n, n_y), np.nan)
+    found = np.full((3, n, n_y), np.nan)
     m = np.zeros(A)
     P = np.zeros((A, A))
     m[:N] = values.m0
     P[:N, :N] = values.P0
-    work, T, z, w4, s4 = scratch(layout, values)
+    work = workspace(layout, values)
+    T = np.empty((N, A))
     c = np.empty(A)
     for time in range(n):
         enter(time, layout, values, m, P, T)
-        for i in range(layout.channels.shape[0]):
-            append(i, time, layout, values, m, P, work, z, w4, s4)
+        for i in range(inner(layout)):
+            append(i, time, layout, values, m, P, work)
         for o in range(n_y):
-            y = values.y[time, o]
-            if math.isnan(y):
+            if math.isnan(values.y[time, o]):
                 continue
-            h = values.H[o]
-            covary(P, h, c)
-            r = y - dot(h, m) - values.y_offset[time, o]
-            s = dot(h, c)
-            innovation[time, o] = r
-            variance[time, o] = s + values.R[time, o]
-            _, alpha, beta = noise_terms(r, s, values.R[time, o], layout.share, layout.multiple)
+            h = seen(o, layout, values)
+            p = _quadratic(P, h, c)
+            _predict(time, o, layout, values, dot(h, m), p, work, found[:, time, o])
+            _, alpha, beta = output_terms(time, o, layout, values, m, P, c, work)
             update(P, m, c, alpha, beta)
-    return innovation, variance
+    for time in range(n):
+        for o in range(n_y):
+            found[0, time, o] = values.y[time, o] - found[0, time, o]
+            found[1, time, o] += values.R[time, o]
+    return found[0], found[1], found[2]

@@ -97,8 +97,8 @@ def predict(fit: Fit, record: Record, horizon: int, samples: int, seed: int) -> 
             lambda b: smoothing.predict_ahead(problem.layout, elements[b], horizon), len(elements)
         )
         scale, shift = _units(fit)
-        mean = shift + scale * np.stack([m for m, _ in found])
-        variance = scale**2 * np.stack([v for _, v in found])
+        mean = shift + scale * np.stack([one[0] for one in found])
+        variance = scale**2 * np.stack([one[1] for one in found])
         generator = np.random.default_rng(seed)
         noise = scale**2 * _noise_variance(fit.system, inputs, len(mean), generator)
     parts = {

@@ -167,7 +167,7 @@ def _smoothed(observed: Any, y: torch.Tensor) -> tuple[np.ndarray, np.ndarray, n
     def moments(b: int) -> np.ndarray:
         one = elements[b]
         _, means, covariances, _, _ = recursion.run(layout, one)
-        mean, variance = smoothing.leave_one_out(layout, one, means, covariances)
+        mean, variance, _ = smoothing.leave_one_out(layout, one, means, covariances)
         gain = variance / (variance + one.R)
         return np.stack([mean + gain * (one.y - mean), (1.0 - gain) * variance, one.R + 0.0 * mean])
 

@@ -40,7 +40,7 @@ def simulated(seed: int) -> tuple[dgp.Record, dgp.Record, np.ndarray]:
     data = dgp.datasets.load("wiener", seed=seed)
     assert data.truth is not None
     assert isinstance(data.train, dgp.Record)
-    return data.train, data.test, data.truth.clean_test[:, 0]
+    return data.train, data.test, np.ravel(data.truth.clean_test)
 
 
 def identify(seed: int, **options: Any) -> dict[str, float]:

@@ -41,9 +41,13 @@ def random_problem(
     distinct=2,
     repeated=True,
     missing=True,
+    measured=False,
     seed=0,
 ):
-    """Everything at random: layer i sees the states and all earlier layers, and so do outputs."""
+    """Everything at random: layer i sees the states and all earlier layers, and so do outputs.
+
+    measured: the only output is the last layer's, and its update that of `measured_function`.
+    """
     rng = np.random.default_rng(seed)
     normal = rng.standard_normal
     N, D, S = 2 * pairs, sum(b.channels for b in blocks), len(blocks)
@@ -59,6 +63,7 @@ def random_problem(
         [TABLE if b.form == "table" else KERNELS[b.form] for b in blocks],
         share,
         multiple,
+        measured=measured,
     )
     G = np.zeros((D, A))
     row = column = 0

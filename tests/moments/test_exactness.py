@@ -137,7 +137,9 @@ def test_leave_one_out(name, noise):
     """Each noise-free output given all samples but its own, with those of the same time."""
     case = case_of(name, noise)
     _, means, covariances, _, _ = recursion.run(case.problem.layout, case.values)
-    mean, variance = smoothing.leave_one_out(case.problem.layout, case.values, means, covariances)
+    mean, variance, _ = smoothing.leave_one_out(
+        case.problem.layout, case.values, means, covariances
+    )
     there = ~np.isnan(case.y)
     assert np.array_equal(~np.isnan(mean), there)
     assert np.array_equal(~np.isnan(variance), there)
@@ -156,13 +158,13 @@ def test_predictions_and_innovations(name, noise):
     layout, values = case.problem.layout, case.values
     i = case.joint.index(case.last)
     for horizon in (1, 3):
-        mean, variance = smoothing.predict_ahead(layout, values, horizon)
+        mean, variance, _ = smoothing.predict_ahead(layout, values, horizon)
         expected = [case.given(max(k - horizon + 1, 0)) for k in range(N)]
         at = [m[i[k]] + case.offset for k, (m, _) in enumerate(expected)]
         of = [np.diag(P)[i[k]] for k, (_, P) in enumerate(expected)]
         assert_close(mean, np.array(at), rtol=1e-8)
         assert_close(variance, np.array(of), rtol=1e-8)
-    innovation, variance = smoothing.innovate(layout, values)
+    innovation, variance, _ = smoothing.innovate(layout, values)
     assert np.array_equal(np.isnan(innovation), np.isnan(case.y))
     # Outputs of one time are used one after the other.
     for k, o in zip(*np.nonzero(~np.isnan(case.y)), strict=True):

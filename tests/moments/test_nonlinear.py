@@ -1,5 +1,8 @@
 """How good Gaussian moments are where layers are not linear: brute force and particle filters.
 
+Joint moments of the state and the function's output serve inside a cascade ("joint"); the exact
+first two moments given each sample where the function is what is measured ("measured").
+
 That the equations are right is checked to rounding elsewhere (test_smoothing, test_exactness). Here
 the method's own error is measured; bounds are about 1.3 times what was measured, and wherever the
 nonlinearity matters the error has to be well below that of linearising at the mean, which an
@@ -30,9 +33,9 @@ def rms(x):
     return float(np.sqrt(np.mean(np.square(x))))
 
 
-def smoothed(w):
+def smoothed(w, measured):
     """Mean and sd of g given all outputs: ours, and of the linearised filter."""
-    problem = w.problem()
+    problem = w.problem(measured)
     values = element(problem)
     row = np.array([[*w.system.C[0], 0.0]])
     _, means, covariances, _, _ = recursion.run(problem.layout, values)
@@ -62,19 +65,23 @@ def test_moments_of_one_sample(name, error):
 
 
 # Bounds: error of the log-likelihood [nats, mean], of smoothed means [posterior sds, rms], of
-# smoothed sds [logarithm, rms]. Measured: 0.03, 0.02, 0.024; 0.2, 0.11, 0.13; 0.15, 0.14, 0.09.
-@pytest.mark.parametrize(("name", "bounds"), [
-    ("mild", (0.045, 0.03, 0.035)),
-    ("saturation", (0.28, 0.15, 0.17)),
-    ("positive part", (0.22, 0.18, 0.13)),
+# smoothed sds [logarithm, rms]. Measured: 0.03, 0.02, 0.024; 0.2, 0.11, 0.13; 0.15, 0.14, 0.09;
+# then 0.0002, 0.001, 0.004; 0.004, 0.023, 0.04; 0.002, 0.021, 0.03.
+@pytest.mark.parametrize(("name", "measured", "bounds"), [
+    ("mild", False, (0.045, 0.03, 0.035)),
+    ("saturation", False, (0.28, 0.15, 0.17)),
+    ("positive part", False, (0.22, 0.18, 0.13)),
+    ("mild", True, (0.0003, 0.0013, 0.005)),
+    ("saturation", True, (0.0045, 0.03, 0.052)),
+    ("positive part", True, (0.003, 0.028, 0.04)),
 ])  # fmt: skip
-def test_short_records_by_brute_force(name, bounds):
+def test_short_records_by_brute_force(name, measured, bounds):
     likelihood, mean_errors, linear_errors, sd_errors = [], [], [], []
     for n, seeds in ((2, range(8)), (3, range(8)), (4, range(1))):
         for seed in seeds:
             w = Wiener(name, n, seed=seed)
             exact, mean, sd = brute_force(w.known, w.covariance, w.f, w.y, w.noise_sd**2)
-            (ours, our_sd), linear, value, _ = smoothed(w)
+            (ours, our_sd), linear, value, _ = smoothed(w, measured)
             likelihood.append(value - exact)
             mean_errors.extend((ours - mean) / sd)
             linear_errors.extend((linear - mean) / sd)
@@ -86,10 +93,15 @@ def test_short_records_by_brute_force(name, bounds):
 
 
 # Bounds: error of each derivative over its root mean square, and correlation with it.
-@pytest.mark.parametrize(("name", "error", "correlation"), [
-    ("mild", 0.18, 0.98), ("saturation", 0.7, 0.75), ("positive part", 0.5, 0.9),
+@pytest.mark.parametrize(("name", "measured", "error", "correlation"), [
+    ("mild", False, 0.18, 0.98),
+    ("saturation", False, 0.7, 0.75),
+    ("positive part", False, 0.5, 0.9),
+    ("mild", True, 0.01, 0.999),
+    ("saturation", True, 0.05, 0.99),
+    ("positive part", True, 0.05, 0.99),
 ])  # fmt: skip
-def test_gradient_follows_that_of_the_exact_likelihood(name, error, correlation):
+def test_gradient_follows_that_of_the_exact_likelihood(name, measured, error, correlation):
     """By noise variance, size of the known response, amplitude of f, variance of process noise."""
     exact, ours = [], []
     for seed in range(16):
@@ -102,7 +114,7 @@ def test_gradient_follows_that_of_the_exact_likelihood(name, error, correlation)
 
         h = 1e-4 * np.eye(4)
         exact.append([(likelihood(1.0 + e) - likelihood(1.0 - e)) / 2e-4 for e in h])
-        p, s = w.problem(), torch.ones(4, dtype=torch.float64, requires_grad=True)
+        p, s = w.problem(measured), torch.ones(4, dtype=torch.float64, requires_grad=True)
         scaled = replace(
             p,
             R=s[0] * p.R,
@@ -134,29 +146,34 @@ def particles(w, count, seed=0):
 
 
 # Bounds: log-likelihood per sample [nats], filtered means and smoothed means [posterior sds, rms],
-# sds [log, rms]. Measured: 0.002, 0.02, 0.06, 0.06; 0.06, 0.11, 0.22, 0.17; 0.002, 0.15, 0.19, 0.1.
+# sds [log, rms]. Joint: 0.002, 0.02, 0.06, 0.06; 0.06, 0.11, 0.22, 0.17; 0.002, 0.15, 0.19, 0.1.
+# Measured: below 0.001 per sample, smoothed means 0.06 to 0.09.
 # Drawn paths alone leave 0.06 in smoothed means and 0.04 in sds.
-@pytest.mark.parametrize(("name", "seed", "bounds"), [
-    ("mild", 0, (0.01, 0.03, 0.09, 0.08)),
-    ("saturation", 1, (0.08, 0.15, 0.29, 0.23)),
-    ("positive part", 1, (0.01, 0.2, 0.25, 0.14)),
+@pytest.mark.parametrize(("name", "seed", "measured", "bounds"), [
+    ("mild", 0, False, (0.01, 0.03, 0.09, 0.08)),
+    ("saturation", 1, False, (0.08, 0.15, 0.29, 0.23)),
+    ("positive part", 1, False, (0.01, 0.2, 0.25, 0.14)),
+    ("mild", 0, True, (0.001, 0.03, 0.09, 0.08)),
+    ("saturation", 1, True, (0.001, 0.03, 0.12, 0.08)),
+    ("positive part", 1, True, (0.001, 0.03, 0.09, 0.08)),
 ])  # fmt: skip
-def test_long_record_by_particles(name, seed, bounds):
+def test_long_record_by_particles(name, seed, measured, bounds):
     w = Wiener(name, 60, seed=seed)
     runs = [particles(w, 10_000, seed=s) for s in range(3)]
     exact, error = (f([total for total, _ in runs]) for f in (np.mean, np.std))
-    (ours, our_sd), linear, value, linear_value = smoothed(w)
+    (ours, our_sd), linear, value, linear_value = smoothed(w, measured)
     assert abs(value - exact) < bounds[0] * w.n + 2.0 * error
     # Filtered: a weighted mean over all particles.
     C, kept = w.system.C[0], runs[0][1]
     mean = np.array([x @ C @ weight for x, weight in kept])
     sd = np.sqrt(np.array([(x @ C) ** 2 @ weight for x, weight in kept]) - mean**2)
-    problem = w.problem()
-    plain = oracles.run(problem.layout, element(problem))
-    filtered = np.array([C @ m[:2] for m, _ in plain.after])
-    filtered_sd = np.sqrt([C @ P[:2, :2] @ C for _, P in plain.after])
-    assert rms((filtered - mean) / sd) < bounds[1]
-    assert rms(np.log(filtered_sd / sd)) < bounds[3]
+    if not measured:
+        problem = w.problem()
+        plain = oracles.run(problem.layout, element(problem))
+        filtered = np.array([C @ m[:2] for m, _ in plain.after])
+        filtered_sd = np.sqrt([C @ P[:2, :2] @ C for _, P in plain.after])
+        assert rms((filtered - mean) / sd) < bounds[1]
+        assert rms(np.log(filtered_sd / sd)) < bounds[3]
     # Smoothed: trajectories drawn backwards through fewer particles.
     rng = np.random.default_rng(0)
     fewer = [(x[rng.choice(len(x), 1500, p=weight)], np.ones(1500)) for x, weight in kept]
@@ -172,19 +189,23 @@ def test_long_record_by_particles(name, seed, bounds):
 
 # Measured: root mean square 0.03, 0.14, 0.20; what the filter's own likelihood with and without the
 # sample gives is off by as much (0.04, 0.21, 0.19), at n times the cost.
-@pytest.mark.parametrize(
-    ("name", "error"), [("mild", 0.04), ("saturation", 0.18), ("positive part", 0.26)]
-)
-def test_leave_one_out_density_by_brute_force(name, error):
+@pytest.mark.parametrize(("name", "measured", "error"), [
+    ("mild", False, 0.04),
+    ("saturation", False, 0.18),
+    ("positive part", False, 0.26),
+    ("mild", True, 0.001),
+    ("saturation", True, 0.024),
+    ("positive part", True, 0.021),
+])  # fmt: skip
+def test_leave_one_out_density_by_brute_force(name, measured, error):
     ours, exact, forward = [], [], []
     for seed in range(6):
         w = Wiener(name, 4, seed=seed)
-        problem = w.problem()
+        problem = w.problem(measured)
         values = element(problem)
         _, means, covariances, _, _ = recursion.run(problem.layout, values)
-        mean, variance = smoothing.leave_one_out(problem.layout, values, means, covariances)
-        sd = np.sqrt(variance[:, 0] + w.noise_sd**2)
-        ours.append(norm.logpdf(w.y, mean[:, 0], sd))
+        found = smoothing.leave_one_out(problem.layout, values, means, covariances)
+        ours.append(found[2][:, 0])
         noise = w.noise_sd**2
         whole = brute_force(w.known, w.covariance, w.f, w.y, noise, nodes=27)[0]
         for t in range(w.n):
@@ -196,4 +217,5 @@ def test_leave_one_out_density_by_brute_force(name, error):
             forward.append(float(log_density(problem) - log_density(replace(problem, y=y))))
     off = np.ravel(ours) - exact
     assert rms(off) < error
-    assert rms(off) < 1.1 * rms(np.array(forward) - exact)
+    if not measured:  # with exact moments both are near enough
+        assert rms(off) < 1.1 * rms(np.array(forward) - exact)

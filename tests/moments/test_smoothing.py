@@ -61,7 +61,7 @@ def test_last_state(name):
 @pytest.mark.parametrize("name", CASES)
 def test_predictions(name, horizon):
     layout, values, plain = filtered(name)
-    mean, variance = smoothing.predict_ahead(layout, values, horizon)
+    mean, variance, _ = smoothing.predict_ahead(layout, values, horizon)
     exact_mean, exact = oracles.ahead(layout, values, plain, horizon)
     assert_close(mean, exact_mean, rtol=1e-9)
     assert_close(variance, exact, rtol=1e-8)
@@ -70,7 +70,7 @@ def test_predictions(name, horizon):
 def test_a_horizon_beyond_the_record_predicts_from_the_first_state():
     layout, values, plain = filtered("table")
     n = len(layout.step)
-    mean, variance = smoothing.predict_ahead(layout, values, n + 5)
+    mean, variance, _ = smoothing.predict_ahead(layout, values, n + 5)
     exact_mean, exact = oracles.ahead(layout, values, plain, n + 5)
     assert_close(mean, exact_mean, rtol=1e-9)
     assert_close(variance, exact, rtol=1e-8)
@@ -80,7 +80,7 @@ def test_a_horizon_beyond_the_record_predicts_from_the_first_state():
 def test_innovations(name):
     """Whitened by their variances they give the log-density: no other factorisation is needed."""
     layout, values, plain = filtered(name)
-    innovation, variance = smoothing.innovate(layout, values)
+    innovation, variance, _ = smoothing.innovate(layout, values)
     gone = np.isnan(values.y)
     assert np.array_equal(np.isnan(innovation), gone)
     assert np.array_equal(np.isnan(variance), gone)

@@ -82,7 +82,8 @@ class Wiener:
             self.system, self.step
         )
 
-    def problem(self):
+    def problem(self, measured=False):
+        """With the update of joint moments, or that of an output measured through f."""
         F, Q = self.transition
         grid = np.linspace(LOW, HIGH, GRID)
         zero = np.zeros
@@ -110,7 +111,7 @@ class Wiener:
             "R": np.full((self.n, 1), self.noise_sd**2),
         }
         step = np.concatenate([[-1], np.zeros(self.n - 1, dtype=int)])
-        layout = make_layout(step, [1], [1], [TABLE], np.ones(1), np.ones(1))
+        layout = make_layout(step, [1], [1], [TABLE], np.ones(1), np.ones(1), measured=measured)
         tensors = {k: torch.tensor(np.array(v), dtype=torch.float64) for k, v in values.items()}
         return FilterProblem(layout, **tensors)
 

@@ -1,0 +1,254 @@
+r"""An output that is a function of one signal, y = f(g) + e, inside the filter, compiled.
+
+What the sample says of g ~ N(c, p) is not Gaussian: where f is flat it says nothing, where f folds
+it speaks for two places. The update is that of the exact first two moments of g given y,
+
+    l = log int N(g; c, p) N(y; f(g), v(g) + R) dg,   alpha = dl/dc,   beta = -d^2 l/dc^2,
+
+and all else follows since it is jointly Gaussian with g: m <- m + Cov(a, g) alpha, and so on. Joint
+moments of g and f(g), which serve inside a cascade, would have flat and steep parts share what the
+sample says.
+
+The integral: N(c, p) is the sum of Gaussians at xi_q = SPACING q of standard deviation SPREAD, in
+units of sqrt(p), with Gaussian weights (Alspach & Sorenson 1972, IEEE TAC 17(4):439). To each of
+them f is its regression line, with what a line leaves as noise, all by Gauss-Hermite quadrature of
+three nodes, which are the component's own and the second neighbours. That is exact for a linear f,
+and good for others however small R is: no node has to meet the peak of the likelihood.
+
+The noise is a mixture of Gaussians, as in `recursion`. v is the function's own variance.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from pyro_dynogp._compiled_cache import OPTIONS
+from pyro_dynogp.moments.functions import locate
+
+# The sum reproduces a Gaussian to 1e-9 up to six standard deviations. SPREAD is such that the nodes
+# sqrt(3) SPREAD beside a component's are the second neighbours.
+SPACING, REACH = 0.2, 35
+SPREAD = 2.0 * SPACING / math.sqrt(3.0)
+# Components of less weight than rounding would show are left out of sums.
+_NOTHING = 1e-17
+NODES = SPACING * np.arange(-REACH, REACH + 1.0)
+COUNT = len(NODES)
+_SQUARE = SPREAD * SPREAD
+
+
+def _log_weights(variance: float) -> np.ndarray:
+    """Of a normal distribution's values at the nodes, adding up to one."""
+    density = -0.5 * NODES**2 / variance
+    return density - np.log(np.exp(density).sum())
+
+
+# Of the components, and of the standard normal distribution itself.
+LOG_WEIGHTS = _log_weights(1.0 - _SQUARE)
+STANDARD = np.exp(_log_weights(1.0))
+_HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
+
+
+@njit(**OPTIONS)
+def bench(components):
+    """Work arrays of the following functions.
+
+    Returns:
+        (COUNT + 4,) the function at all nodes and two more on either side; (3, COUNT) mean,
+        variance beside the line, and slope by xi of each component; (COUNT, components) weights.
+    """
+    return np.empty(COUNT + 4), np.empty((3, COUNT)), np.empty((COUNT, components))
+
+
+@njit(**OPTIONS)
+def _evaluate(i, layout, values, centre, root, work):
+    """Static layer i at the nodes centre + root xi, and each component's regression line."""
+    row = layout.f_start[i]
+    grid = values.table_mean.shape[1]
+    f, at, w4, s4 = work.curve, work.at, work.weight4, work.slope4
+    for j in range(COUNT + 4):
+        z = centre + root * SPACING * (j - REACH - 2)
+        k = locate(z, values.low[i], values.spacing[i], grid, w4, s4)
+        mean = 0.0
+        variance = 0.0
+        for b in range(4):
+            mean += w4[b] * values.table_mean[row, k + b]
+            variance += w4[b] * values.table_variance[row, k + b]
+        f[j] = mean
+        if 2 <= j < COUNT + 2:
+            at[1, j - 2] = max(variance, 0.0)
+    for q in range(COUNT):
+        bend = f[q] - 2.0 * f[q + 2] + f[q + 4]
+        at[0, q] = f[q + 2] + bend / 6.0
+        at[1, q] += bend * bend / 18.0
+        at[2, q] = (f[q + 4] - f[q]) / (4.0 * SPACING)
+
+
+@njit(**OPTIONS)
+def _weigh(y, R, share, multiple, at, weights):
+    """Turn log weights of all components into weights given y; the log of their sum."""
+    top = -np.inf
+    K = share.shape[0]
+    for q in range(COUNT):
+        r = y - at[0, q]
+        line = at[2, q] * at[2, q] * _SQUARE + at[1, q]
+        for k in range(K):
+            S = line + R * multiple[k]
+            t = LOG_WEIGHTS[q] + math.log(share[k]) - 0.5 * (math.log(S) + r * r / S)
+            weights[q, k] = t
+            top = max(top, t)
+    total = 0.0
+    for q in range(COUNT):
+        for k in range(K):
+            weights[q, k] = math.exp(weights[q, k] - top)
+            total += weights[q, k]
+    for q in range(COUNT):
+        for k in range(K):
+            weights[q, k] /= total
+    return top + math.log(total)
+
+
+@njit(**OPTIONS)
+def _moments(y, R, multiple, at, weights):
+    """Mean and variance of xi given y."""
+    mean = 0.0
+    K = multiple.shape[0]
+    for q in range(COUNT):
+        r = y - at[0, q]
+        for k in range(K):
+            if weights[q, k] < _NOTHING:
+                continue
+            S = at[2, q] * at[2, q] * _SQUARE + at[1, q] + R * multiple[k]
+            mean += weights[q, k] * (NODES[q] + _SQUARE * at[2, q] * r / S)
+    variance = 0.0
+    for q in range(COUNT):
+        r = y - at[0, q]
+        for k in range(K):
+            if weights[q, k] < _NOTHING:
+                continue
+            S = at[2, q] * at[2, q] * _SQUARE + at[1, q] + R * multiple[k]
+            along = _SQUARE * at[2, q] / S
+            off = NODES[q] + along * r - mean
+            variance += weights[q, k] * (_SQUARE * (1.0 - along * at[2, q]) + off * off)
+    return mean, variance
+
+
+@njit(**OPTIONS)
+def function_terms(i, y, R, centre, p, layout, values, work):
+    """Value l, alpha = dl/dc and beta = -d^2 l/dc^2 of the log-density of y = f(g) + e.
+
+    Args:
+        i: static layer f. y: measured, without the output's known part. R: variance of the noise.
+        centre, p: mean c and variance of g.
+    """
+    root = math.sqrt(p)
+    _evaluate(i, layout, values, centre, root, work)
+    at, weights = work.at, work.weights
+    l = _weigh(y, R, layout.share, layout.multiple, at, weights)
+    mean, variance = _moments(y, R, layout.multiple, at, weights)
+    return l - _HALF_LOG_2PI, mean / root, (1.0 - variance) / p
+
+
+@njit(**OPTIONS)
+def function_adjoint(i, y, R, centre, p, layout, values, bars, work, alpha_bar, beta_bar):
+    """Reverse of `function_terms` where l counts once: adds to bars of the function.
+
+    Returns:
+        Gradients by y, R, centre and p.
+    """
+    root = math.sqrt(p)
+    _evaluate(i, layout, values, centre, root, work)
+    at, weights, w4, s4 = work.at, work.weights, work.weight4, work.slope4
+    _weigh(y, R, layout.share, layout.multiple, at, weights)
+    mean, variance = _moments(y, R, layout.multiple, at, weights)
+    beta = (1.0 - variance) / p
+    # variance = second - mean^2
+    second_bar = -beta_bar / p
+    mean_bar = alpha_bar / root - 2.0 * mean * second_bar
+    p_bar = -0.5 * alpha_bar * mean / (p * root) - beta_bar * beta / p
+    R_bar = 0.0
+    y_bar = 0.0
+    f_bar = np.zeros(COUNT)
+    v_bar = np.zeros(COUNT)
+    slope_bar = np.zeros(COUNT)
+    K = layout.multiple.shape[0]
+    level = mean_bar * mean + second_bar * (variance + mean * mean)  # what weights have in common
+    for q in range(COUNT):
+        r = y - at[0, q]
+        s = at[2, q]
+        for k in range(K):
+            weight = weights[q, k]
+            if weight < _NOTHING:
+                continue
+            S = s * s * _SQUARE + at[1, q] + R * layout.multiple[k]
+            along = _SQUARE * s / S
+            first = NODES[q] + along * r
+            spread = _SQUARE * (1.0 - along * s)
+            term_bar = weight * (
+                1.0 + mean_bar * first + second_bar * (spread + first * first) - level
+            )
+            first_bar = weight * (mean_bar + 2.0 * second_bar * first)
+            spread_bar = weight * second_bar
+            along_bar = first_bar * r - spread_bar * _SQUARE * s
+            S_bar = -along_bar * along / S + 0.5 * term_bar * (r * r / S - 1.0) / S
+            r_bar = first_bar * along - term_bar * r / S
+            slope_bar[q] += (
+                along_bar * _SQUARE / S - spread_bar * _SQUARE * along + S_bar * 2.0 * s * _SQUARE
+            )
+            v_bar[q] += S_bar
+            R_bar += S_bar * layout.multiple[k]
+            f_bar[q] -= r_bar
+            y_bar += r_bar
+    f = work.curve
+    curve_bar = np.zeros(COUNT + 4)
+    for q in range(COUNT):
+        bend = f[q] - 2.0 * f[q + 2] + f[q + 4]
+        bend_bar = f_bar[q] / 6.0 + v_bar[q] * bend / 9.0
+        slope = slope_bar[q] / (4.0 * SPACING)
+        curve_bar[q] += bend_bar - slope
+        curve_bar[q + 2] += f_bar[q] - 2.0 * bend_bar
+        curve_bar[q + 4] += bend_bar + slope
+    centre_bar = 0.0
+    row = layout.f_start[i]
+    grid = values.table_mean.shape[1]
+    for j in range(COUNT + 4):
+        xi = SPACING * (j - REACH - 2)
+        z = centre + root * xi
+        k = locate(z, values.low[i], values.spacing[i], grid, w4, s4)
+        variance = 0.0
+        for b in range(4):
+            variance += w4[b] * values.table_variance[row, k + b]
+        # Where a negative variance was cut off, and beside the components, there is no gradient.
+        own_bar = v_bar[j - 2] if 2 <= j < COUNT + 2 and variance > 0.0 else 0.0
+        z_bar = 0.0
+        for b in range(4):
+            bars.table_mean[row, k + b] += curve_bar[j] * w4[b]
+            bars.table_variance[row, k + b] += own_bar * w4[b]
+            z_bar += s4[b] * (
+                curve_bar[j] * values.table_mean[row, k + b]
+                + own_bar * values.table_variance[row, k + b]
+            )
+        # The grid itself may move: f depends on (z - low) / spacing.
+        bars.low[i] -= z_bar
+        bars.spacing[i] -= z_bar * (z - values.low[i]) / values.spacing[i]
+        centre_bar += z_bar
+        p_bar += 0.5 * z_bar * xi / root
+    return y_bar, R_bar, centre_bar, p_bar
+
+
+@njit(**OPTIONS)
+def function_moments(i, centre, p, layout, values, work):
+    """Mean and variance of f(g) for g ~ N(centre, p)."""
+    _evaluate(i, layout, values, centre, math.sqrt(p), work)
+    f, at = work.curve, work.at
+    mean = 0.0
+    for q in range(COUNT):
+        mean += STANDARD[q] * f[q + 2]
+    variance = 0.0
+    for q in range(COUNT):
+        off = f[q + 2] - mean
+        bend = f[q] - 2.0 * f[q + 2] + f[q + 4]
+        variance += STANDARD[q] * (off * off + at[1, q] - bend * bend / 18.0)
+    return mean, variance
