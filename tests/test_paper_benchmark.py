@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import pyro_dynogp as dgp
-from tests.benchmarks.paper import ours, run
+from tests.benchmarks.paper import bound, ours, run
 from tests.benchmarks.paper.experiments import EXPERIMENTS
 from tests.benchmarks.paper.page import number, page, spread
 from tests.benchmarks.paper.prediction import Predicted, scores
@@ -134,3 +134,30 @@ def test_jobs_cover_everything_but_what_is_left_out():
     assert ("drives_1", "pyro_dynogp, stacked", 2) in found
     assert ("circuit", "pyro_dynogp, stacked", 0) not in found
     assert ("wiener_own", "GP-NARX", 49) in found
+
+
+def test_bound_by_monte_carlo(monkeypatch):
+    """Generalised least squares on simulated open samples, process noise by Cholesky."""
+    rng = np.random.default_rng(0)
+    A, C = np.diag([-30.0, -20.0]), np.array([[1.0, 0.5]])
+    L, noise_sd = np.array([[1.0], [2.0]]), 0.05
+    B = np.array([[40.0, 10.0], [5.0, 30.0]])
+    monkeypatch.setattr(bound, "system", lambda seed: (A, B, C, L, noise_sd))
+    time = bound.STEP * np.arange(2500)
+    angle = np.outer(time, bound.FREQUENCIES)
+    basis = np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
+    g = bound.response(A, B, C, np.sin(angle))
+    seen = np.flatnonzero(g[:1500] > 0.0)
+    stationary = np.outer(L, L) / (30.0 * np.array([[2, 5 / 3], [5 / 3, 4 / 3]]))
+    lags = np.abs(seen[:, None] - seen) * bound.STEP
+    K = sum(
+        C[0, i] * C[0, j] * stationary[i, j] * np.exp(A[i, i] * lags)
+        for i in range(2) for j in range(2)
+    )  # fmt: skip
+    K = 0.5 * (K + K.T) + noise_sd**2 * np.eye(len(seen))
+    errors = np.linalg.cholesky(K) @ rng.standard_normal((len(seen), 400))
+    weighted = np.linalg.solve(K, basis[seen])
+    wrong = np.linalg.solve(basis[seen].T @ weighted, weighted.T @ errors)
+    off = (basis[1500:] @ wrong)[g[1500:] > 0.0]
+    found = np.sqrt(np.square(off).sum() / (1000 * 400)) / noise_sd
+    assert bound.clean_error_bound(0) == pytest.approx(found, rel=0.05)

@@ -218,7 +218,10 @@ def inner(layout):
 
 @njit(**OPTIONS)
 def run(layout, values):
-    """Log-density of a record, and the state (m, P) before each segment's first sample."""
+    """Log-density of a record, the state before each segment's first sample, and the last one.
+
+    The last one, (A,) and (A, A), is that of [x; f] given all data.
+    """
     n = layout.step.shape[0]
     N = values.m0.shape[0]
     A = values.G.shape[1]
@@ -241,6 +244,8 @@ def run(layout, values):
         for i in range(inner(layout)):
             append(i, time, layout, values, m, P, work)
         total += measure(time, layout, values, m, P, c, work)
+    for i in range(inner(layout), layout.channels.shape[0]):
+        append(i, n - 1, layout, values, m, P, work)
     return total, means, covariances, m, P
 
 

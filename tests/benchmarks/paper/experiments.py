@@ -134,7 +134,7 @@ def _electricity(seed: int) -> tuple[dgp.Record, dict[str, dgp.Record], dict[str
 
 STUDY = Experiment(
     "simulated Wiener", _wiener, (5, "static"), (True,), seconds=90.0, seeds=tuple(range(10)),
-    test_process_noise=False, simulated=True,
+    test_process_noise=False, simulated=True, targets={"rmse_over_floor": 1.02},
     note=f"Seeds 0 to 9 of the published records where {wiener.VARIABLE} names their folder, else "
     "of our own simulator; RMSE and CRPS over those of the true predictive distribution.",
 )  # fmt: skip
@@ -170,6 +170,8 @@ EXPERIMENTS = {
         targets={"rmse": 291.0, "mae": 215.0, "crps": 197.0},
         paper={"rmse": (291.0, 297.0, 376.0), "mae": (215.0, 235.0, 273.0),
                "crps": (197.0, np.nan, 258.0)},
-        note="Scaled with the training period only; the paper's run scales with the test, too.",
+        note="Scaled with the training period only; the paper's run scales with the test, too. "
+        "Without process noise, which forecasts the last fifth of the training period from the "
+        "rest far better than process noise in the last layer (RMSE 403 and 842 MW).",
     ),
 }  # fmt: skip

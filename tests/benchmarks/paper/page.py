@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from tests.benchmarks.markdown import table
+from tests.benchmarks.paper.bound import clean_error_bound
 from tests.benchmarks.paper.experiments import EXPERIMENTS, Experiment
 from tests.benchmarks.paper.figures import experiment_figure, study_figure
 from tests.benchmarks.paper.prediction import OURS
@@ -57,6 +58,8 @@ def _section(key: str, experiment: Experiment, rows: Sequence[Row], folder: Path
         parts.append(_table(experiment, done, name, published=name == names[0]))
     parts.append(_costs(done))
     parts += _targets(experiment, done)
+    if experiment.simulated:
+        parts += _against_peers(done)
     parts += _notes(rows)
     if done:
         draw = study_figure if experiment.simulated else experiment_figure
@@ -145,20 +148,61 @@ def _targets(experiment: Experiment, rows: Sequence[Row]) -> list[str]:
         found = float(np.median(values_of(own, OURS, test or tests[0], score)))
         verdict = "reached" if found <= limit else f"not reached, {found / limit - 1.0:.0%} above"
         where = f" ({test})" if test else ""
-        lines.append(
-            f"- {score.upper()}{where}: {number(found)}, target {number(limit)}: {verdict}."
-        )
+        name = _name(score) if experiment.simulated else score.upper()
+        lines.append(f"- {name}{where}: {number(found)}, target {number(limit)}: {verdict}.")
     return ["Targets, from default settings:", "\n".join(lines)]
 
 
+def _name(score: str) -> str:
+    """As the study's table has it."""
+    return next(name for name, own in STUDY_COLUMNS.items() if own == score)
+
+
+# Score, the peer it is set against, and the most that the median of the ratios should be.
+RIVALS = (("clean_over_floor", "dynoNet", 0.7), ("first_over_floor", "dynoNet", 1.0),
+          ("crps_over_floor", "GP-NARX", 1.0))  # fmt: skip
+
+
+def _against_peers(rows: Sequence[Row]) -> list[str]:
+    """Seed by seed beside a peer, and beside what can be known at all."""
+    found = {(row["method"], row["seed"]): row["scores"]["test"] for row in rows if row["scores"]}
+    seeds = sorted(seed for method, seed in found if method == OURS)
+    lines = []
+    for score, peer, limit in RIVALS:
+        common = [seed for seed in seeds if (peer, seed) in found]
+        ratios = [
+            _score(found[OURS, seed], score) / _score(found[peer, seed], score) for seed in common
+        ]
+        if ratios:
+            lines.append(
+                f"- {_name(score)} over that of {peer}, {len(common)} seeds: "
+                f"{spread(np.array(ratios))}, target {number(limit)}."
+            )
+    if seeds:
+        bounds = np.array([clean_error_bound(seed) for seed in seeds])
+        own = np.array([_score(found[OURS, seed], "clean_over_floor") for seed in seeds])
+        lines.append(
+            f"- Cramer-Rao bound of the clean RMSE / floor, for who knows all but the response to "
+            f"the inputs: {spread(bounds)}, which is an RMSE / floor of "
+            f"{number(float(np.median(np.sqrt(1.0 + bounds**2))))} in the median; the clean RMSE "
+            f"is {spread(own / bounds)} times the bound."
+        )
+    return ["\n".join(lines)] if lines else []
+
+
 def _notes(rows: Sequence[Row]) -> list[str]:
-    """Notes of methods, and failures, each once."""
-    found: dict[str, None] = {}
+    """Of each method what its first run notes, in how many runs it was otherwise, and failures."""
+    notes: dict[str, list[str]] = {}
+    found = []
     for row in rows:
         if row.get("note"):
-            found[f"- {row['method']}: {row['note']}"] = None
+            notes.setdefault(row["method"], []).append(row["note"])
         if "failed" in row:
-            found[f"- {row['method']}, seed {row['seed']}: failed, {row['failed']}"] = None
+            found.append(f"- {row['method']}, seed {row['seed']}: failed, {row['failed']}")
+    for method, own in notes.items():
+        others = sum(note != own[0] for note in own)
+        more = f" (other runs: {others} of {len(own)} otherwise)" if others else ""
+        found.append(f"- {method}: {own[0]}{more}")
     return ["\n".join(found)] if found else []
 
 
