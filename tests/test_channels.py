@@ -137,7 +137,12 @@ def test_a_calendar_knows_local_time() -> None:
     np.testing.assert_allclose(hours[:, 0], np.cos(2 * np.pi * np.asarray(local.hour) / 24))
     weekend = channels.Calendar("weekend", "Europe/Berlin").columns(own)[:, 0]
     assert (weekend == (np.asarray(local.day_of_week) >= 5)).all()
-    for what, count in (("weekday", 6), ("time of year", 12), ("hour of day by weekend", 25)):
+    for what, count in (
+        ("weekday", 6),
+        ("time of year", 12),
+        ("hour of day by weekend", 25),
+        ("turn of the year", 7),
+    ):
         assert channels.Calendar(what).columns(own).shape == (96, count)
 
 

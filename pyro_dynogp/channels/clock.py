@@ -14,6 +14,9 @@ from pyro_dynogp.channels.signal import Replacement
 from pyro_dynogp.record import Record
 from pyro_dynogp.signals import delayed
 
+# Half the width of a hat at the turn of the year [days].
+HAT = 4.0
+# Seconds of a day, days of a year.
 DAY, DAYS_A_YEAR = 86400.0, 365.2425
 
 
@@ -93,7 +96,9 @@ class Calendar(Channel):
 
     Args:
         what: "hour of day" (harmonics of the day), "weekend" (one column), "weekday" (six), "hour
-            of day by weekend" (both, and their products) or "time of year" (harmonics of the year).
+            of day by weekend" (both, and their products), "time of year" (harmonics of the year)
+            or "turn of the year" (seven hats four days apart around the first of January: what
+            shuts down over the holidays).
         zone: an IANA time zone such as "Australia/Melbourne".
         harmonics: of the day, or of the year.
     """
@@ -175,6 +180,21 @@ def _seasons(day: np.ndarray, weekday: np.ndarray, year: np.ndarray, harmonics: 
     return fourier(year, harmonics)
 
 
+def turn_of_the_year(year: np.ndarray) -> np.ndarray:
+    """Seven hats (n, 7) around the turn of the year, zero from 16 days before and after it.
+
+    Args:
+        year: (n,) share of the year that has gone by.
+    """
+    days = (np.asarray(year) % 1.0 + 0.5) % 1.0 * DAYS_A_YEAR - 0.5 * DAYS_A_YEAR
+    centres = HAT * np.arange(-3.0, 4.0)
+    return np.clip(1.0 - np.abs(days[:, None] - centres) / HAT, 0.0, None)
+
+
+def _turn(day: np.ndarray, weekday: np.ndarray, year: np.ndarray, harmonics: int) -> np.ndarray:
+    return turn_of_the_year(year)
+
+
 # Columns of each part of the calendar from the share of the day, the day of the week (Monday 0)
 # and the share of the year that have gone by.
 PARTS = {
@@ -183,4 +203,5 @@ PARTS = {
     "weekday": _weekday,
     "hour of day by weekend": _both,
     "time of year": _seasons,
+    "turn of the year": _turn,
 }

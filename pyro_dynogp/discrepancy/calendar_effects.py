@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from pyro_dynogp._errors import invalid
+from pyro_dynogp.channels.clock import DAYS_A_YEAR, turn_of_the_year
 from pyro_dynogp.discrepancy.clock_effects import clock_shift
 from pyro_dynogp.discrepancy.clocks import all_zones, in_zone, stamps_of
 from pyro_dynogp.discrepancy.evidence import Curve, Evidence, Residuals
@@ -20,6 +21,7 @@ __all__ = ["calendar", "clock_shift"]
 # Days that must be looked at before a contrast is tried: fewer do not repeat it.
 DAYS_FOR_HOURS, DAYS_FOR_WEEK, DAYS_FOR_YEAR = 3, 14, 548
 WEEKDAYS = ("Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun")
+TURN = ("20 Dec", "24 Dec", "28 Dec", "1 Jan", "5 Jan", "9 Jan", "13 Jan")
 SEASONS = ("Dec-Feb", "Mar-May", "Jun-Aug", "Sep-Nov")
 
 
@@ -48,7 +50,8 @@ def calendar(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 0) 
     calendar up, not make one.
 
     Group averages are free for hour of day (24), weekday (7), weekend (2), hour by weekend (48),
-    season (4); time of year is two harmonics of a year. One statistic for all and for all zones.
+    season (4); time of year is two harmonics of a year, the turn of the year seven hats four days
+    apart around the first of January. One statistic for all and for all zones.
 
     Args:
         residuals: of one output (n,), with stamps.
@@ -57,7 +60,8 @@ def calendar(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 0) 
 
     Returns:
         where: what ("hour of day", "weekday", "weekend", "hour of day by weekday/weekend",
-        "season", "time of year"), zone (that of the stamps where clocks cannot be told apart).
+        "season", "time of year", "turn of the year"), zone (that of the stamps where clocks
+        cannot be told apart).
 
     Raises:
         ValueError: where there are no stamps, a zone is unknown, the record is shorter than three
@@ -154,6 +158,10 @@ def _in_zone(local: pd.DatetimeIndex, zone: str, days: int) -> tuple[list[Contra
         year = np.column_stack([f(k * angle) for k in (1, 2) for f in (np.cos, np.sin)])
         months = [pd.Timestamp(2000, m, 1).strftime("%B") for m in range(1, 13)]
         add("time of year", 4, year, month, months)
+        gone = (np.asarray(local.day_of_year) - 1.0 + np.asarray(local.hour) / 24.0) / DAYS_A_YEAR
+        hats = turn_of_the_year(gone)
+        near = np.where(hats.any(1), hats.argmax(1), len(TURN))
+        add("turn of the year", len(TURN), hats, near, (*TURN, "the rest of the year"))
     return contrasts, np.concatenate(blocks, axis=1) if blocks else np.zeros((len(hour), 0))
 
 

@@ -181,6 +181,16 @@ class TestCalendar:
         assert found.p_value < 1e-3
         assert found.where["what"] in ("time of year", "season")
 
+    def test_a_shutdown_over_the_holidays_is_found(self):
+        clock = pd.date_range("2020-01-01", periods=1100, freq="D", tz="UTC")
+        day = np.asarray(clock.month * 100 + clock.day)
+        shut = (day >= 1222) | (day <= 110)
+        r = residuals(0, 1100, step=1.0, stamps=clock, effect=lambda *_: -2.5 * shut)
+        found = calendar(r)
+        assert found.p_value < 1e-3
+        assert found.where["what"] == "turn of the year"
+        assert "least at" in found.sentence
+
     def test_stamps_and_zones_must_be_there(self):
         with pytest.raises(ValueError, match="time stamps"):
             calendar(residuals(0))
