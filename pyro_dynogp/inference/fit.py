@@ -29,6 +29,9 @@ from pyro_dynogp.record import Record
 
 __all__ = ["Fit", "fit"]
 
+# Iterations of SVI around the optima of a cascade.
+POLISH = 60
+
 
 def fit(
     model: LinearDynamicGP | Cascade,
@@ -82,7 +85,8 @@ def fit(
         restarts: number of starting points (default 6; 8 for a cascade, 2 with trajectories as
             sites).
         steps: most iterations of a start (default 500; Adam 1500; cascade 600) and, with "svi", of
-            SVI (default 1000; cascade 60, with trajectories as sites 1000).
+            SVI (default 1000; cascade 60, and no more while its hyperparameters stay at the
+            optimum, around which it begins all but normal).
         optimizer: "lbfgs" or "adam", for the starts; "adam" by default for a cascade, whose density
             has long ridges on which line searches stop, or lead to where noise is fitted.
         draws: posterior draws to keep ("svi", default 200) or to sample per chain ("nuts", 500).
@@ -192,12 +196,13 @@ def fit(
     best = optima[0]
     if method == "svi":
         chosen = hyperparameters or ("map" if cascade else "multivariate normal")
+        most = steps or (POLISH if cascade else 1000)
         found = posterior_of(
             target,
             argument,
             optima,
             chosen,
-            steps=steps or (60 if cascade else 1000),
+            steps=min(most, POLISH) if chosen == "map" else most,
             particles=particles,
             learning_rate=learning_rate,
             seed=seed,
