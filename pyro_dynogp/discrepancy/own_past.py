@@ -21,8 +21,9 @@ import numpy as np
 from scipy.signal import lfilter
 
 from pyro_dynogp._errors import invalid
+from pyro_dynogp.discrepancy.filters import fitted_filter
 from pyro_dynogp.discrepancy.scan import Scan, tail_probability
-from pyro_dynogp.discrepancy.whitening import Whitener, autoregression
+from pyro_dynogp.discrepancy.whitening import Whitener
 
 REPLICATES, CHUNK = 200, 50
 # Samples before a replicate begins.
@@ -66,7 +67,7 @@ def regress(
     if not len(variants):
         raise invalid("variants", expected="at least one", got="none")
     n = len(residual)
-    p = max(autoregression(residual).order, 1)
+    p = max(fitted_filter(residual).order, 1)
     series = _lags(residual, p)
     there = np.isfinite(series).all(0)
     N = np.ones((n, 1)) if nuisance is None else np.column_stack([np.ones(n), nuisance])
@@ -111,7 +112,7 @@ def regress(
 
 def noise_filter(residual: np.ndarray, columns: np.ndarray) -> Whitener:
     """Filter of the noise: a residual's own past (n,), NaN where missing, beside columns (n, M)."""
-    series = _lags(residual, max(autoregression(residual).order, 1))
+    series = _lags(residual, max(fitted_filter(residual).order, 1))
     there = np.isfinite(series).all(0)
     return _colour(series, np.column_stack([np.ones(len(residual)), columns]), there)
 

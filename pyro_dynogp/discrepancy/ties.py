@@ -8,8 +8,8 @@ import numpy as np
 from scipy import stats
 from scipy.signal import lfilter
 
+from pyro_dynogp.discrepancy.filters import fitted_filter
 from pyro_dynogp.discrepancy.scan import tail_probability
-from pyro_dynogp.discrepancy.whitening import autoregression
 
 # Values as near as this to each other, against the range, are the same number.
 SAME = 1e-9
@@ -56,7 +56,7 @@ def ties_at_the_top(
     if count < 3 or spread == 0:
         return Ties(top, count, 1.0, size)
     residual = np.where(there, output - mean, np.nan)
-    whiten = autoregression(residual)
+    whiten = fitted_filter(residual)
     q = _resolution(y, spread)
     e = whiten(residual)
     e = e[np.isfinite(e)]

@@ -5,7 +5,7 @@ from scipy import stats
 from scipy.signal import lfilter
 
 from pyro_dynogp.discrepancy.evidence import Residuals
-from pyro_dynogp.discrepancy.whitening import autoregression
+from pyro_dynogp.discrepancy.filters import fitted_filter
 
 
 def coloured(rng, shape, pole):
@@ -25,7 +25,7 @@ def residuals_of(
     """What a detector gets; draws of the parameters differ in the gain of the mean."""
     rng = np.random.default_rng(seed + 1000)
     e = output - mean
-    inside = autoregression(e)
+    inside = fitted_filter(e)
     innovations = np.concatenate([np.full(inside.order, np.nan), inside(e)])
     n = len(output)
     return Residuals(
