@@ -192,7 +192,7 @@ def output_terms(time, o, layout, values, m, P, c, work):
     R = values.R[time, o]
     if layout.measured >= 0:
         centre = dot(h, m) + values.offset[time, layout.g_start[layout.measured]]
-        p = dot(h, c) + FLOOR
+        p = max(dot(h, c), 0.0) + FLOOR
         return function_terms(layout.measured, y, R, centre, p, layout, values, work)
     return noise_terms(y - dot(h, m), dot(h, c), R, layout.share, layout.multiple)
 
@@ -349,7 +349,7 @@ def _measure_adjoint(time, layout, values, bars, m, P, m_bar, P_bar, C, alphas, 
             row = layout.g_start[layout.measured]
             centre = dot(h, m) + values.offset[time, row]
             y_bar, R_bar, centre_bar, s_bar = function_adjoint(
-                layout.measured, y, R, centre, dot(h, c) + FLOOR, layout, values, bars, work,
+                layout.measured, y, R, centre, max(dot(h, c), 0.0) + FLOOR, layout, values, bars, work,
                 alpha_bar, beta_bar,
             )  # fmt: skip
             bars.offset[time, row] += centre_bar

@@ -48,7 +48,7 @@ def _predict(time, o, layout, values, centre, p, work, found):
     if layout.measured >= 0:
         i = layout.measured
         centre += values.offset[time, layout.g_start[i]]
-        p += FLOOR
+        p = max(p, 0.0) + FLOOR
         mean, variance = function_moments(i, centre, p, layout, values, work)
         l, _, _ = function_terms(i, y, R, centre, p, layout, values, work)
     else:

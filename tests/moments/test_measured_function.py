@@ -233,6 +233,15 @@ def test_density_is_that_of_the_filter_by_quadrature(blocks, student):
     assert abs(float(log_density(joint)) - exact) > 0.1
 
 
+def test_a_variance_of_rounding_errors_is_none():
+    """Covariances of states without process noise lose their sign to rounding."""
+    wiener = Wiener("saturation", 5)
+    problem = wiener.problem(measured=True)
+    nothing = torch.zeros_like(problem.Q)
+    flat = replace(problem, Q=nothing, P0=-1e-9 * torch.eye(2, dtype=torch.float64))
+    assert np.isfinite(float(log_density(flat)))
+
+
 def test_densities_one_step_ahead_add_up():
     problem = random_problem((LINE,), measured=True, student=True, seed=3)
     values = element(problem)
