@@ -348,10 +348,10 @@ def _measure_adjoint(time, layout, values, bars, m, P, m_bar, P_bar, C, alphas, 
         if layout.measured >= 0:
             row = layout.g_start[layout.measured]
             centre = dot(h, m) + values.offset[time, row]
+            p = max(dot(h, c), 0.0) + FLOOR
             y_bar, R_bar, centre_bar, s_bar = function_adjoint(
-                layout.measured, y, R, centre, max(dot(h, c), 0.0) + FLOOR, layout, values, bars, work,
-                alpha_bar, beta_bar,
-            )  # fmt: skip
+                layout.measured, y, R, centre, p, layout, values, bars, work, alpha_bar, beta_bar
+            )
             bars.offset[time, row] += centre_bar
             h_bar = bars.G[row]
         else:
