@@ -28,12 +28,12 @@ from numba import njit
 from pyro_dynogp._compiled_cache import OPTIONS
 from pyro_dynogp.moments.functions import locate
 
-# The sum reproduces a Gaussian to 1e-9 up to six standard deviations. SPREAD is such that the nodes
-# sqrt(3) SPREAD beside a component's are the second neighbours.
-SPACING, REACH = 0.2, 35
+# The sum reproduces a Gaussian's density to 1e-7 up to five standard deviations. With this SPREAD
+# the nodes sqrt(3) SPREAD beside a component's are the second neighbours.
+SPACING, REACH = 0.2, 33
 SPREAD = 2.0 * SPACING / math.sqrt(3.0)
-# Components of less weight than rounding would show are left out of sums.
-_NOTHING = 1e-17
+# Logarithm of the least weight beside the largest: less would be lost in rounding.
+_LEAST = -40.0
 NODES = SPACING * np.arange(-REACH, REACH + 1.0)
 COUNT = len(NODES)
 _SQUARE = SPREAD * SPREAD
@@ -91,18 +91,19 @@ def _weigh(y, R, share, multiple, at, weights):
     """Turn log weights of all components into weights given y; the log of their sum."""
     top = -np.inf
     K = share.shape[0]
-    for q in range(COUNT):
-        r = y - at[0, q]
-        line = at[2, q] * at[2, q] * _SQUARE + at[1, q]
-        for k in range(K):
-            S = line + R * multiple[k]
-            t = LOG_WEIGHTS[q] + math.log(share[k]) - 0.5 * (math.log(S) + r * r / S)
+    for k in range(K):
+        log_share = math.log(share[k])
+        for q in range(COUNT):
+            r = y - at[0, q]
+            S = at[2, q] * at[2, q] * _SQUARE + at[1, q] + R * multiple[k]
+            t = LOG_WEIGHTS[q] + log_share - 0.5 * (math.log(S) + r * r / S)
             weights[q, k] = t
             top = max(top, t)
     total = 0.0
     for q in range(COUNT):
         for k in range(K):
-            weights[q, k] = math.exp(weights[q, k] - top)
+            t = weights[q, k] - top
+            weights[q, k] = math.exp(t) if t > _LEAST else 0.0
             total += weights[q, k]
     for q in range(COUNT):
         for k in range(K):
@@ -118,7 +119,7 @@ def _moments(y, R, multiple, at, weights):
     for q in range(COUNT):
         r = y - at[0, q]
         for k in range(K):
-            if weights[q, k] < _NOTHING:
+            if weights[q, k] == 0.0:
                 continue
             S = at[2, q] * at[2, q] * _SQUARE + at[1, q] + R * multiple[k]
             mean += weights[q, k] * (NODES[q] + _SQUARE * at[2, q] * r / S)
@@ -126,7 +127,7 @@ def _moments(y, R, multiple, at, weights):
     for q in range(COUNT):
         r = y - at[0, q]
         for k in range(K):
-            if weights[q, k] < _NOTHING:
+            if weights[q, k] == 0.0:
                 continue
             S = at[2, q] * at[2, q] * _SQUARE + at[1, q] + R * multiple[k]
             along = _SQUARE * at[2, q] / S
@@ -180,7 +181,7 @@ def function_adjoint(i, y, R, centre, p, layout, values, bars, work, alpha_bar, 
         s = at[2, q]
         for k in range(K):
             weight = weights[q, k]
-            if weight < _NOTHING:
+            if weight == 0.0:
                 continue
             S = s * s * _SQUARE + at[1, q] + R * layout.multiple[k]
             along = _SQUARE * s / S

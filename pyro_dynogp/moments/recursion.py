@@ -198,15 +198,18 @@ def output_terms(time, o, layout, values, m, P, c, work):
 
 
 @njit(**OPTIONS)
-def measure(time, layout, values, m, P, c, work):
-    """Use the outputs of one sample; the sum of their log-densities is returned."""
+def measure(time, layout, values, m, P, c, work, alphas, betas):
+    """Use the outputs of one sample; the sum of their log-densities is returned.
+
+    alphas, betas: (n_y,), written to.
+    """
     total = 0.0
     for o in range(values.y.shape[1]):
         if math.isnan(values.y[time, o]):
             continue
-        l, alpha, beta = output_terms(time, o, layout, values, m, P, c, work)
+        l, alphas[o], betas[o] = output_terms(time, o, layout, values, m, P, c, work)
         total += l
-        update(P, m, c, alpha, beta)
+        update(P, m, c, alphas[o], betas[o])
     return total
 
 
@@ -235,6 +238,8 @@ def run(layout, values):
     work = workspace(layout, values)
     T = np.empty((N, A))
     c = np.empty(A)
+    alphas = np.empty(values.y.shape[1])
+    betas = np.empty(values.y.shape[1])
     total = 0.0
     for time in range(n):
         enter(time, layout, values, m, P, T)
@@ -243,7 +248,7 @@ def run(layout, values):
             covariances[time // SEGMENT] = P[:N, :N]
         for i in range(inner(layout)):
             append(i, time, layout, values, m, P, work)
-        total += measure(time, layout, values, m, P, c, work)
+        total += measure(time, layout, values, m, P, c, work, alphas, betas)
     for i in range(inner(layout), layout.channels.shape[0]):
         append(i, n - 1, layout, values, m, P, work)
     return total, means, covariances, m, P
@@ -399,8 +404,8 @@ def run_adjoint(layout, values, bars, means, covariances):
     T_bar = np.empty((N, A))
     C = np.zeros((n_y, A))
     c_bar = np.empty(A)
-    alphas = np.zeros(n_y)
-    betas = np.zeros(n_y)
+    alphas = np.zeros((SEGMENT, n_y))
+    betas = np.zeros((SEGMENT, n_y))
     before_m = np.empty((SEGMENT, N))
     before_P = np.empty((SEGMENT, N, N))
     for segment in range(means.shape[0] - 1, -1, -1):
@@ -416,23 +421,38 @@ def run_adjoint(layout, values, bars, means, covariances):
             if time < last - 1:
                 for i in range(S):
                     append(i, time, layout, values, m, P, work)
-                measure(time, layout, values, m, P, c_bar, work)
+                measure(
+                    time,
+                    layout,
+                    values,
+                    m,
+                    P,
+                    c_bar,
+                    work,
+                    alphas[time - first],
+                    betas[time - first],
+                )
         for time in range(last - 1, first - 1, -1):
             m[:N] = before_m[time - first]
             P[:N, :N] = before_P[time - first]
             for i in range(S):
                 append(i, time, layout, values, m, P, work)
+            alpha = alphas[time - first]
+            beta = betas[time - first]
             for o in range(n_y):
                 if math.isnan(values.y[time, o]):
                     continue
-                _, alphas[o], betas[o] = output_terms(time, o, layout, values, m, P, C[o], work)
-                update(P, m, C[o], alphas[o], betas[o])
+                if time == last - 1:  # not measured above
+                    _, alpha[o], beta[o] = output_terms(time, o, layout, values, m, P, C[o], work)
+                else:
+                    covary(P, seen(o, layout, values), C[o])
+                update(P, m, C[o], alpha[o], beta[o])
             if time < n - 1:
                 k = layout.step[time + 1]
                 if k >= 0:
                     _move_adjoint(k, layout, values, bars, m, P, m_bar, P_bar, T, T_bar)
             _measure_adjoint(
-                time, layout, values, bars, m, P, m_bar, P_bar, C, alphas, betas, c_bar, work
+                time, layout, values, bars, m, P, m_bar, P_bar, C, alpha, beta, c_bar, work
             )
             for i in range(S - 1, -1, -1):
                 append_adjoint(i, time, layout, values, bars, m, P, m_bar, P_bar, work)

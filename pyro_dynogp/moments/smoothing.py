@@ -82,6 +82,8 @@ def predict_ahead(layout, values, horizon):
     work = workspace(layout, values)
     T = np.empty((N, A))
     c = np.empty(A)
+    alphas = np.empty(n_y)
+    betas = np.empty(n_y)
     for target in range(min(horizon, n)):  # no data yet
         if target > 0:
             enter(target, layout, values, ahead_m, ahead_P, T)
@@ -96,7 +98,7 @@ def predict_ahead(layout, values, horizon):
             enter(time, layout, values, m, P, T)
         for i in range(S):
             append(i, time, layout, values, m, P, work)
-        measure(time, layout, values, m, P, c, work)
+        measure(time, layout, values, m, P, c, work, alphas, betas)
         ahead_m[:] = m
         ahead_P[:] = P
         for target in range(time + 1, time + horizon + 1):
@@ -239,7 +241,7 @@ def _backwards(layout, values, rows, means, covariances):
             before_P[time - first] = P[:N, :N]
             for i in range(S):
                 append(i, time, layout, values, m, P, work)
-            measure(time, layout, values, m, P, c, work)
+            measure(time, layout, values, m, P, c, work, alphas, betas)
         for time in range(last - 1, first - 1, -1):
             m[:N] = before_m[time - first]
             P[:N, :N] = before_P[time - first]
