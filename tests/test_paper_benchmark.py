@@ -95,8 +95,8 @@ def test_page(tmp_path):
     text = page(rows, tmp_path)
     assert "| pyro_dynogp | 0.1 (0.08 to 0.2) |" in text
     assert "| dynoGP, published | 0.147 | 0.109 | 0.081 |" in text
-    assert "RMSE: 0.1, target 0.085: not reached, 18% above." in text
-    assert "CRPS: 0.0333, target 0.055: reached." in text
+    assert "RMSE: 0.1, target 0.085: not reached, 17.6% above." in text
+    assert "CRPS: 0.03333, target 0.055: reached." in text
     assert "deep GP, seed 0: failed, out of memory" in text
     assert "dynoNet: time was up" in text
     assert (tmp_path / "drives_2" / "figure.png").stat().st_size > 10_000

@@ -146,10 +146,10 @@ def _targets(experiment: Experiment, rows: Sequence[Row]) -> list[str]:
     for target, limit in experiment.targets.items():
         score, _, test = target.partition(" ")
         found = float(np.median(values_of(own, OURS, test or tests[0], score)))
-        verdict = "reached" if found <= limit else f"not reached, {found / limit - 1.0:.0%} above"
+        verdict = "reached" if found <= limit else f"not reached, {found / limit - 1.0:.1%} above"
         where = f" ({test})" if test else ""
         name = _name(score) if experiment.simulated else score.upper()
-        lines.append(f"- {name}{where}: {number(found)}, target {number(limit)}: {verdict}.")
+        lines.append(f"- {name}{where}: {found:.4g}, target {number(limit)}: {verdict}.")
     return ["Targets, from default settings:", "\n".join(lines)]
 
 
