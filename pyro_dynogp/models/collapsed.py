@@ -454,8 +454,10 @@ class ObservedCascade(TorchDistribution):
 
     The log-density is that of a Gaussian assumed-density filter over the joint state of all dynamic
     layers: exact where the static layers are linear and the noise is Gaussian, else as good as
-    Gaussian moments are. Where only the last layer's trajectory is unknown no filter is needed: see
-    `pyro_dynogp.models.known`. Event shape (n,), or (n, n_y). NaN marks a missing sample.
+    Gaussian moments are: joint ones of a static layer's input and output inside the cascade; where
+    the last layer is a function of one signal, those of the state given each sample. Where only the
+    last layer's trajectory is unknown no filter is needed: see `pyro_dynogp.models.known`. Event
+    shape (n,), or (n, n_y). NaN marks a missing sample.
 
     Args:
         system: layers given their parameters. time: (n,) or a `TimeGrid`. inputs: (n, n_u) scaled.

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import pyro_dynogp as dgp
@@ -91,6 +92,22 @@ def test_half_of_the_block_that_is_searched_can_be_fitted_to() -> None:
     assert some[-1]
     assert not some[:240].any()
     assert not some[240]
+
+
+def test_a_line_of_a_day_is_named_after_the_calendar() -> None:
+    """Where there are time stamps, and both explain the same."""
+    plain = machine(seed=3)
+    stamps = pd.date_range("2021-01-04", periods=len(plain), freq="h", tz="UTC")
+    y = plain.outputs[:, 0] + 0.3 * np.cos(2.0 * np.pi * np.arange(len(plain)) / 24.0)
+    record = dgp.Record(stamps, plain.inputs, y)
+    looked_for = (effects.PeriodicDisturbance(), effects.CalendarEffect())
+    report = dgp.close_loop(
+        fitted(record), record, effects=looked_for, max_rounds=1, workers=1, progress=False
+    )
+    (effect,) = report.effects
+    assert effect.name == "calendar"
+    assert effect.ties in ((), ("periodic disturbance",))
+    assert report.after["rmse"] < 0.06
 
 
 @pytest.mark.parametrize("instant", [150, 300])

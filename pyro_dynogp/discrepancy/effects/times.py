@@ -94,6 +94,7 @@ class PeriodicDisturbance(Effect):
 
     name = "periodic disturbance"
     family = "time"
+    freedom = 4  # its period is free, where the calendar's are known
     test = staticmethod(periodic_disturbance)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
