@@ -112,27 +112,32 @@ def _weigh(y, R, share, multiple, at, weights):
 
 
 @njit(**OPTIONS)
+def _given_output(q, y, noise, at):
+    """Component q given y: variance of y, regression of xi on y, mean and variance of xi.
+
+    noise: variance of the measurement noise.
+    """
+    slope = at[2, q]
+    S = slope * slope * _SQUARE + at[1, q] + noise
+    along = _SQUARE * slope / S
+    return S, along, NODES[q] + along * (y - at[0, q]), _SQUARE * (1.0 - along * slope)
+
+
+@njit(**OPTIONS)
 def _moments(y, R, multiple, at, weights):
     """Mean and variance of xi given y."""
-    mean = 0.0
     K = multiple.shape[0]
+    mean = 0.0
     for q in range(COUNT):
-        r = y - at[0, q]
         for k in range(K):
-            if weights[q, k] == 0.0:
-                continue
-            S = at[2, q] * at[2, q] * _SQUARE + at[1, q] + R * multiple[k]
-            mean += weights[q, k] * (NODES[q] + _SQUARE * at[2, q] * r / S)
+            if weights[q, k] > 0.0:
+                mean += weights[q, k] * _given_output(q, y, R * multiple[k], at)[2]
     variance = 0.0
     for q in range(COUNT):
-        r = y - at[0, q]
         for k in range(K):
-            if weights[q, k] == 0.0:
-                continue
-            S = at[2, q] * at[2, q] * _SQUARE + at[1, q] + R * multiple[k]
-            along = _SQUARE * at[2, q] / S
-            off = NODES[q] + along * r - mean
-            variance += weights[q, k] * (_SQUARE * (1.0 - along * at[2, q]) + off * off)
+            if weights[q, k] > 0.0:
+                _, _, first, spread = _given_output(q, y, R * multiple[k], at)
+                variance += weights[q, k] * (spread + (first - mean) ** 2)
     return mean, variance
 
 
@@ -183,10 +188,7 @@ def function_adjoint(i, y, R, centre, p, layout, values, bars, work, alpha_bar, 
             weight = weights[q, k]
             if weight == 0.0:
                 continue
-            S = s * s * _SQUARE + at[1, q] + R * layout.multiple[k]
-            along = _SQUARE * s / S
-            first = NODES[q] + along * r
-            spread = _SQUARE * (1.0 - along * s)
+            S, along, first, spread = _given_output(q, y, R * layout.multiple[k], at)
             term_bar = weight * (
                 1.0 + mean_bar * first + second_bar * (spread + first * first) - level
             )
