@@ -37,25 +37,32 @@ def _quadratic(P, h, c):
 
 
 @njit(**OPTIONS)
-def _predict(time, o, layout, values, centre, p, work, found):
-    """Write mean and variance of a noise-free output, and the log-density of the measured one.
+def _noise_free(time, o, layout, values, centre, p, work):
+    """Mean and variance of an output without its noise.
 
     centre, p: mean and variance of the filtered part of what the output is measured through.
     """
-    offset = values.y_offset[time, o]
-    y = values.y[time, o] - offset
+    if layout.measured >= 0:
+        i = layout.measured
+        at = centre + values.offset[time, layout.g_start[i]]
+        mean, variance = function_moments(i, at, max(p, 0.0) + FLOOR, layout, values, work)
+    else:
+        mean, variance = centre, p
+    return mean + values.y_offset[time, o], variance
+
+
+@njit(**OPTIONS)
+def _predict(time, o, layout, values, centre, p, work, found):
+    """Write what `_noise_free` returns, and the log-density of the measured output."""
+    found[0], found[1] = _noise_free(time, o, layout, values, centre, p, work)
+    y = values.y[time, o] - values.y_offset[time, o]
     R = values.R[time, o]
     if layout.measured >= 0:
         i = layout.measured
-        centre += values.offset[time, layout.g_start[i]]
-        p = max(p, 0.0) + FLOOR
-        mean, variance = function_moments(i, centre, p, layout, values, work)
-        l, _, _ = function_terms(i, y, R, centre, p, layout, values, work)
+        at = centre + values.offset[time, layout.g_start[i]]
+        l, _, _ = function_terms(i, y, R, at, max(p, 0.0) + FLOOR, layout, values, work)
     else:
-        mean, variance = centre, p
         l, _, _ = noise_terms(y - centre, p, R, layout.share, layout.multiple)
-    found[0] = mean + offset
-    found[1] = variance
     found[2] = np.nan if math.isnan(y) else l
 
 
@@ -329,11 +336,10 @@ def innovate(layout, values):
                 continue
             h = seen(o, layout, values)
             p = _quadratic(P, h, c)
-            _predict(time, o, layout, values, dot(h, m), p, work, found[:, time, o])
-            _, alpha, beta = output_terms(time, o, layout, values, m, P, c, work)
+            mean, variance = _noise_free(time, o, layout, values, dot(h, m), p, work)
+            l, alpha, beta = output_terms(time, o, layout, values, m, P, c, work)
+            found[0, time, o] = values.y[time, o] - mean
+            found[1, time, o] = variance + values.R[time, o]
+            found[2, time, o] = l
             update(P, m, c, alpha, beta)
-    for time in range(n):
-        for o in range(n_y):
-            found[0, time, o] = values.y[time, o] - found[0, time, o]
-            found[1, time, o] += values.R[time, o]
     return found[0], found[1], found[2]
