@@ -16,6 +16,11 @@ from pathlib import Path
 
 # Division by zero gives infinity, which callers tell from a covariance.
 OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
+# For what allocates nothing and returns no array: the caller holds all arrays, and counting its
+# references would cost more than the arithmetic of one sample.
+BORROWING = {**OPTIONS, "_nrt": False}
+# The same where an array is returned; the caller's own options rule then.
+INLINED = {**OPTIONS, "inline": "always"}
 
 
 def drop_stale(folder: Path) -> list[Path]:

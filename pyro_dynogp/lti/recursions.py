@@ -24,13 +24,13 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from pyro_dynogp._compiled_cache import OPTIONS
+from pyro_dynogp._compiled_cache import BORROWING, OPTIONS
 
 # Rows between checkpoints of an adjoint: its matrices stay in the processor's cache.
 _SEGMENT = 64
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def _rotate_columns(S, re, im):
     """S <- S Phi' in place."""
     pairs = re.shape[0]
@@ -42,7 +42,7 @@ def _rotate_columns(S, re, im):
             S[i, pairs + j] = im[j] * a + re[j] * b
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def _rotate_rows(S, re, im):
     """S <- Phi S in place."""
     pairs = re.shape[0]
@@ -56,7 +56,7 @@ def _rotate_rows(S, re, im):
             S[pairs + i, j] = q * a + r * b
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def _dot(a, b):
     total = 0.0
     for i in range(a.shape[0]):
@@ -64,7 +64,7 @@ def _dot(a, b):
     return total
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def _times(S, x, out):
     """Write S x to out (S symmetric: sums run down the columns, which vectorises)."""
     n = x.shape[0]
@@ -76,7 +76,7 @@ def _times(S, x, out):
             out[i] += S[j, i] * xj
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def _add_outer(S, a, x, y):
     """S <- S + a x y'."""
     n = x.shape[0]
@@ -86,7 +86,14 @@ def _add_outer(S, a, x, y):
             S[i, j] += c * y[j]
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
+def _copy(S, out):
+    for i in range(S.shape[0]):
+        for j in range(S.shape[1]):
+            out[i, j] = S[i, j]
+
+
+@njit(**BORROWING)
 def _factor_row(S, re, im, k, h, g, k0, v, s, e):
     """Advance the explained covariance S over one row; e is written, the variance p returned."""
     if k >= 0:
@@ -123,7 +130,7 @@ def factor(re, im, step, out, h, g, k0, v, S0):
     return e, p, S_end
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def _add_step_gradient(M, Q, re_bar, im_bar):
     """Gradient of <M, Phi Q'> with respect to the numbers phi: add it to re_bar and im_bar."""
     pairs = re_bar.shape[0]
@@ -131,6 +138,85 @@ def _add_step_gradient(M, Q, re_bar, im_bar):
         k = pairs + i
         re_bar[i] += _dot(M[i], Q[i]) + _dot(M[k], Q[k])
         im_bar[i] += _dot(M[k], Q[i]) - _dot(M[i], Q[k])
+
+
+@njit(**BORROWING)
+def _factor_segment(b, first, last, re, im, step, out, h, g, k0, v, S, s, before, errors, inverse):
+    """Advance S over rows first..last - 1 and keep of each: S before its sample, e and 1 / d."""
+    for i in range(first, last):
+        m = i - first
+        o = out[i]
+        k = step[i]
+        if k >= 0:
+            _rotate_rows(S, re[b, k], im[b, k])
+            _rotate_columns(S, re[b, k], im[b, k])
+        _copy(S, before[m])
+        _times(S, h[b, o], s)
+        inverse[m] = 1.0 / (k0[b, o] - _dot(h[b, o], s) + v[b, i])
+        for j in range(s.shape[0]):
+            errors[m, j] = g[b, o, j] - s[j]
+        _add_outer(S, inverse[m], errors[m], errors[m])
+
+
+@njit(**BORROWING)
+def _factor_row_adjoint(
+    b,
+    i,
+    m,
+    out,
+    h,
+    g,
+    e_bar,
+    p_bar,
+    before,
+    errors,
+    inverse,
+    bar,
+    s,
+    t,
+    h_bar,
+    g_bar,
+    k0_bar,
+    v_bar,
+):
+    """Reverse of a row's sample: gradients are added, `bar` is then that before the sample."""
+    o = out[i]
+    ei = errors[m]
+    _times(bar, ei, t)
+    through_d = -_dot(ei, t) * inverse[m] * inverse[m]
+    pb = p_bar[b, i] + through_d
+    v_bar[b, i] = through_d
+    k0_bar[b, o] += pb
+    for j in range(s.shape[0]):
+        eb = e_bar[b, i, j] + 2.0 * inverse[m] * t[j]
+        g_bar[b, o, j] += eb
+        h_bar[b, o, j] -= pb * (g[b, o, j] - ei[j])
+        s[j] = -eb - pb * h[b, o, j]  # adjoint of s = S h
+    _times(before[m], s, t)
+    for j in range(s.shape[0]):
+        h_bar[b, o, j] += t[j]
+    _add_outer(bar, 0.5, s, h[b, o])
+    _add_outer(bar, 0.5, h[b, o], s)
+
+
+@njit(**BORROWING)
+def _factor_step_adjoint(
+    b, k, m, re, im, back, start, before, errors, inverse, bar, Q, re_bar, im_bar
+):
+    """Reverse of a row's step k. start: S before the segment."""
+    # Q' = Phi S_previous, S_previous after the update of the row before.
+    if m > 0:
+        _copy(before[m - 1], Q)
+        _add_outer(Q, inverse[m - 1], errors[m - 1], errors[m - 1])
+    else:
+        _copy(start, Q)
+    _rotate_columns(Q, re[b, k], im[b, k])
+    for j in range(Q.shape[0]):
+        for l in range(Q.shape[0]):
+            Q[j, l] *= 2.0
+    _add_step_gradient(bar, Q, re_bar[b, k], im_bar[b, k])
+    _rotate_rows(bar, re[b, k], back[b, k])
+    _rotate_columns(bar, re[b, k], back[b, k])
 
 
 @njit(**OPTIONS)
@@ -158,66 +244,37 @@ def factor_adjoint(re, im, step, out, h, g, k0, v, S0, e_bar, p_bar, S_end_bar):
     t = np.empty(J)
     for b in range(batch):
         S[:] = S0[b]
-        for i in range(n):
-            if i % length == 0:
-                starts[i // length] = S
-            o = out[i]
-            _factor_row(S, re[b], im[b], step[i], h[b, o], g[b, o], k0[b, o], v[b, i], s, t)
+        for segment in range(segments):
+            starts[segment] = S
+            first = segment * length
+            last = min(n, first + length)
+            _factor_segment(
+                b, first, last, re, im, step, out, h, g, k0, v, S, s, before, errors, inverse
+            )
         bar = S0_bar[b]
         for segment in range(segments - 1, -1, -1):
             first = segment * length
             last = min(n, first + length)
-            S[:] = starts[segment]
-            for i in range(first, last):
-                m = i - first
-                o = out[i]
-                if step[i] >= 0:
-                    _rotate_rows(S, re[b, step[i]], im[b, step[i]])
-                    _rotate_columns(S, re[b, step[i]], im[b, step[i]])
-                before[m] = S
-                _times(S, h[b, o], s)
-                inverse[m] = 1.0 / (k0[b, o] - _dot(h[b, o], s) + v[b, i])
-                for j in range(J):
-                    errors[m, j] = g[b, o, j] - s[j]
-                _add_outer(S, inverse[m], errors[m], errors[m])
+            start = starts[segment]
+            S[:] = start
+            _factor_segment(
+                b, first, last, re, im, step, out, h, g, k0, v, S, s, before, errors, inverse
+            )
             for i in range(last - 1, first - 1, -1):
                 m = i - first
-                o = out[i]
-                ei = errors[m]
-                _times(bar, ei, t)
-                through_d = -_dot(ei, t) * inverse[m] * inverse[m]
-                pb = p_bar[b, i] + through_d
-                v_bar[b, i] = through_d
-                k0_bar[b, o] += pb
-                for j in range(J):
-                    eb = e_bar[b, i, j] + 2.0 * inverse[m] * t[j]
-                    g_bar[b, o, j] += eb
-                    h_bar[b, o, j] -= pb * (g[b, o, j] - ei[j])
-                    s[j] = -eb - pb * h[b, o, j]  # adjoint of s = S h
-                _times(before[m], s, t)
-                for j in range(J):
-                    h_bar[b, o, j] += t[j]
-                _add_outer(bar, 0.5, s, h[b, o])
-                _add_outer(bar, 0.5, h[b, o], s)
-                k = step[i]
-                if k >= 0:
-                    # Q' = Phi S_previous, S_previous after the update of the row before.
-                    if m > 0:
-                        Q[:] = before[m - 1]
-                        _add_outer(Q, inverse[m - 1], errors[m - 1], errors[m - 1])
-                    else:
-                        Q[:] = starts[segment]
-                    _rotate_columns(Q, re[b, k], im[b, k])
-                    for j in range(J):
-                        for l in range(J):
-                            Q[j, l] *= 2.0
-                    _add_step_gradient(bar, Q, re_bar[b, k], im_bar[b, k])
-                    _rotate_rows(bar, re[b, k], back[b, k])
-                    _rotate_columns(bar, re[b, k], back[b, k])
+                _factor_row_adjoint(
+                    b, i, m, out, h, g, e_bar, p_bar, before, errors, inverse, bar, s, t,
+                    h_bar, g_bar, k0_bar, v_bar,
+                )  # fmt: skip
+                if step[i] >= 0:
+                    _factor_step_adjoint(
+                        b, step[i], m, re, im, back, start, before, errors, inverse, bar, Q,
+                        re_bar, im_bar,
+                    )  # fmt: skip
     return re_bar, im_bar, h_bar, g_bar, k0_bar, v_bar, S0_bar
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def _advance(F, re, im, k):
     """F <- Phi F in place, F (J, R)."""
     if k >= 0:
@@ -333,7 +390,7 @@ def lower_gradient(re, im, step, out, h, w, X, Z_bar):
     return re_bar, im_bar, h_bar, w_bar
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def _information_row(info, re, back, k, h, e, inverse, u):
     """Move the information matrix of later rows across one row; return e' info e (before)."""
     _times(info, e, u)

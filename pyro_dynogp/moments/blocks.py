@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from pyro_dynogp._compiled_cache import OPTIONS
+from pyro_dynogp._compiled_cache import BORROWING, OPTIONS
 from pyro_dynogp.moments.functions import TABLE, expansion, expansion_adjoint, locate
 from pyro_dynogp.moments.measured_function import bench
 
@@ -100,9 +100,11 @@ class Workspace(NamedTuple):
         W: (S, A, d) covariance of a with g. centre: (S, d) mean of g. root: (S, d, d) L.
         f: (S, Q, e) function at the nodes. cross: (S, d, e) sum w xi f'. gain: (S, d, e)
             regression of f on g.
+        square: (d, d) covariance of g, or the gradient by it.
+        W_bar, centre_bar, root_bar, cross_bar, f_bar: gradients, of one layer at a time.
         z, z_bar: (d,) a node, and the gradient by it.
         weight4, slope4: (4,) of a table's interpolation.
-        curve, at, weights: of `measured_function`.
+        curve, at, weights, curve_bar, at_bar: of `measured_function`.
     """
 
     W: np.ndarray
@@ -111,6 +113,12 @@ class Workspace(NamedTuple):
     f: np.ndarray
     cross: np.ndarray
     gain: np.ndarray
+    square: np.ndarray
+    W_bar: np.ndarray
+    centre_bar: np.ndarray
+    root_bar: np.ndarray
+    cross_bar: np.ndarray
+    f_bar: np.ndarray
     z: np.ndarray
     z_bar: np.ndarray
     weight4: np.ndarray
@@ -118,6 +126,8 @@ class Workspace(NamedTuple):
     curve: np.ndarray
     at: np.ndarray
     weights: np.ndarray
+    curve_bar: np.ndarray
+    at_bar: np.ndarray
 
 
 @njit(**OPTIONS)
@@ -128,7 +138,7 @@ def workspace(layout, values):
     e = 1
     for i in range(S):
         e = max(e, layout.outputs[i])
-    curve, at, weights = bench(layout.share.shape[0])
+    curve, at, weights, curve_bar, at_bar = bench(layout.share.shape[0])
     return Workspace(
         np.zeros((S, A, d)),
         np.zeros((S, d)),
@@ -136,6 +146,12 @@ def workspace(layout, values):
         np.zeros((S, Q, e)),
         np.zeros((S, d, e)),
         np.zeros((S, d, e)),
+        np.empty((d, d)),
+        np.empty((A, d)),
+        np.empty(d),
+        np.empty((d, d)),
+        np.empty((d, e)),
+        np.empty(e),
         np.empty(d),
         np.empty(d),
         np.empty(4),
@@ -143,10 +159,12 @@ def workspace(layout, values):
         curve,
         at,
         weights,
+        curve_bar,
+        at_bar,
     )
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def _cholesky(p, root):
     d = p.shape[0]
     for i in range(d):
@@ -160,7 +178,7 @@ def _cholesky(p, root):
                 root[i, j] = total / root[j, j]
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def append(i, time, layout, values, m, P, work):
     """Append the outputs of static layer i to the mean m and covariance P, in place."""
     N = values.m0.shape[0]
@@ -185,7 +203,7 @@ def append(i, time, layout, values, m, P, work):
             for j in range(na):
                 total += P[k, j] * G[j]
             W[k, c] = total
-    p = np.empty((d, d))
+    p = work.square
     for c in range(d):
         for b in range(c + 1):
             total = 0.0
@@ -193,7 +211,7 @@ def append(i, time, layout, values, m, P, work):
                 total += values.G[g0 + c, j] * W[j, b]
             p[c, b] = total
             p[b, c] = total
-    _cholesky(p, root[:d, :d])
+    _cholesky(p[:d, :d], root[:d, :d])
     mean = m[na : na + e]
     block = P[na : na + e, na : na + e]
     for a in range(e):
@@ -257,7 +275,7 @@ def append(i, time, layout, values, m, P, work):
             P[na + a, k] = total
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def append_adjoint(i, time, layout, values, bars, m, P, m_bar, P_bar, work):
     """Reverse mode of `append`: m_bar and P_bar (symmetric) lose the layer's outputs, in place."""
     N = values.m0.shape[0]
@@ -270,11 +288,14 @@ def append_adjoint(i, time, layout, values, bars, m, P, m_bar, P_bar, work):
     root = work.root[i]
     gain = work.gain[i]
     z, z_bar, w4, s4 = work.z, work.z_bar, work.weight4, work.slope4
-    cross_bar = np.empty((d, e))
-    W_bar = np.zeros((na, d))
-    root_bar = np.zeros((d, d))
-    centre_bar = np.zeros(d)
-    f_bar = np.empty(e)
+    cross_bar = work.cross_bar
+    W_bar = work.W_bar
+    root_bar = work.root_bar
+    centre_bar = work.centre_bar
+    f_bar = work.f_bar[:e]
+    W_bar[:na, :d] = 0.0
+    root_bar[:d, :d] = 0.0
+    centre_bar[:d] = 0.0
     for a in range(e):
         for c in range(d):
             total = 0.0
@@ -346,7 +367,7 @@ def append_adjoint(i, time, layout, values, bars, m, P, m_bar, P_bar, work):
             for b in range(c + 1):
                 root_bar[c, b] += z_bar[c] * xi[b]
     # Cholesky: p_bar = L^{-T} sym(tril(L' L_bar)) L^{-1}, its diagonal halved.
-    p_bar = np.zeros((d, d))
+    p_bar = work.square
     for c in range(d):
         for b in range(c + 1):
             total = 0.0

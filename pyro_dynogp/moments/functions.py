@@ -16,14 +16,14 @@ from functools import lru_cache
 import numpy as np
 from numba import njit
 
-from pyro_dynogp._compiled_cache import OPTIONS
+from pyro_dynogp._compiled_cache import BORROWING
 
 # Forms of a static function.
 TABLE = 0
 KERNELS = {"rbf": 1, "matern12": 2, "matern32": 3, "matern52": 4}
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def cubic_weights(u, weight, slope):
     """Weights of the four grid values around a point, and their derivatives by u in [0, 1]."""
     square = u * u
@@ -38,28 +38,48 @@ def cubic_weights(u, weight, slope):
     slope[3] = 1.5 * square - u
 
 
-@njit(**OPTIONS)
-def locate(z, low, spacing, count, weight, slope):
-    """Index of the first of four grid values for z; derivatives by z, zero beyond the ends."""
-    t = (z - low) / spacing
+@njit(**BORROWING)
+def place(t, count):
+    """Where t, in spacings from the grid's first point, lies: first of four values, u, inside.
+
+    u: in [0, 1], from the second of the four. inside: 1, or 0 beyond the ends and where t is NaN.
+    """
     last = count - 2.0
     inside = 1.0
-    if not t > 1.0:  # also where z is NaN
+    if not t > 1.0:
         t = 1.0
         inside = 0.0
     elif t > last:
         t = last
         inside = 0.0
-    first = int(t)
-    if first > count - 3:
-        first = count - 3
-    cubic_weights(t - first, weight, slope)
+    first = min(int(t), count - 3)
+    return first - 1, t - first, inside
+
+
+@njit(**BORROWING)
+def cubic(values, first, u):
+    """Value of the interpolation that `cubic_weights` has, and its derivative by u."""
+    a = values[first]
+    b = values[first + 1]
+    c = values[first + 2]
+    d = values[first + 3]
+    one = 0.5 * (c - a)
+    two = a - 2.5 * b + 2.0 * c - 0.5 * d
+    three = 1.5 * (b - c) + 0.5 * (d - a)
+    return b + u * (one + u * (two + u * three)), one + u * (2.0 * two + u * 3.0 * three)
+
+
+@njit(**BORROWING)
+def locate(z, low, spacing, count, weight, slope):
+    """Index of the first of four grid values for z; derivatives by z, zero beyond the ends."""
+    first, u, inside = place((z - low) / spacing, count)
+    cubic_weights(u, weight, slope)
     for i in range(4):
         slope[i] *= inside / spacing
-    return first - 1
+    return first
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def radial(form, square):
     """Value of kappa and its derivative by r^2, at r^2."""
     if form == 1:
@@ -78,7 +98,7 @@ def radial(form, square):
     return (1.0 + a * r + 5.0 / 3.0 * square) * value, -5.0 / 6.0 * (1.0 + a * r) * value
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def expansion(form, z, Z, inverse, weight, constant, slope, f):
     """Write the outputs f (e,) of a radial expansion at z (d,)."""
     e = f.shape[0]
@@ -97,7 +117,7 @@ def expansion(form, z, Z, inverse, weight, constant, slope, f):
             f[a] += weight[a, m] * value
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def expansion_adjoint(
     form,
     z,

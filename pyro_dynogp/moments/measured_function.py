@@ -25,8 +25,8 @@ import math
 import numpy as np
 from numba import njit
 
-from pyro_dynogp._compiled_cache import OPTIONS
-from pyro_dynogp.moments.functions import locate
+from pyro_dynogp._compiled_cache import BORROWING, OPTIONS
+from pyro_dynogp.moments.functions import cubic, cubic_weights, place
 
 # The sum reproduces a Gaussian's density to 1e-7 up to five standard deviations. With this SPREAD
 # the nodes sqrt(3) SPREAD beside a component's are the second neighbours.
@@ -57,28 +57,38 @@ def bench(components):
 
     Returns:
         (COUNT + 4,) the function at all nodes and two more on either side; (3, COUNT) mean,
-        variance beside the line, and slope by xi of each component; (COUNT, components) weights.
+        variance beside the line, and slope by xi of each component; (COUNT, components) weights;
+        gradients by the first two.
     """
-    return np.empty(COUNT + 4), np.empty((3, COUNT)), np.empty((COUNT, components))
+    return (
+        np.empty(COUNT + 4),
+        np.empty((3, COUNT)),
+        np.empty((COUNT, components)),
+        np.empty(COUNT + 4),
+        np.empty((3, COUNT)),
+    )
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
+def _ruler(i, values, centre, root):
+    """First node and distance of nodes in spacings of the table's grid, from its first point."""
+    scale = 1.0 / values.spacing[i]
+    stride = root * SPACING * scale
+    return (centre - values.low[i]) * scale - stride * (REACH + 2), stride
+
+
+@njit(**BORROWING)
 def _evaluate(i, layout, values, centre, root, work):
     """Static layer i at the nodes centre + root xi, and each component's regression line."""
-    row = layout.f_start[i]
-    grid = values.table_mean.shape[1]
-    f, at, w4, s4 = work.curve, work.at, work.weight4, work.slope4
+    mean = values.table_mean[layout.f_start[i]]
+    variance = values.table_variance[layout.f_start[i]]
+    f, at = work.curve, work.at
+    start, stride = _ruler(i, values, centre, root)
     for j in range(COUNT + 4):
-        z = centre + root * SPACING * (j - REACH - 2)
-        k = locate(z, values.low[i], values.spacing[i], grid, w4, s4)
-        mean = 0.0
-        variance = 0.0
-        for b in range(4):
-            mean += w4[b] * values.table_mean[row, k + b]
-            variance += w4[b] * values.table_variance[row, k + b]
-        f[j] = mean
+        k, u, _ = place(start + stride * j, mean.shape[0])
+        f[j] = cubic(mean, k, u)[0]
         if 2 <= j < COUNT + 2:
-            at[1, j - 2] = max(variance, 0.0)
+            at[1, j - 2] = max(cubic(variance, k, u)[0], 0.0)
     for q in range(COUNT):
         bend = f[q] - 2.0 * f[q + 2] + f[q + 4]
         at[0, q] = f[q + 2] + bend / 6.0
@@ -86,7 +96,7 @@ def _evaluate(i, layout, values, centre, root, work):
         at[2, q] = (f[q + 4] - f[q]) / (4.0 * SPACING)
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def _weigh(y, R, share, multiple, at, weights):
     """Turn log weights of all components into weights given y; the log of their sum."""
     top = -np.inf
@@ -96,52 +106,57 @@ def _weigh(y, R, share, multiple, at, weights):
         for q in range(COUNT):
             r = y - at[0, q]
             S = at[2, q] * at[2, q] * _SQUARE + at[1, q] + R * multiple[k]
-            t = LOG_WEIGHTS[q] + log_share - 0.5 * (math.log(S) + r * r / S)
+            t = LOG_WEIGHTS[q] + log_share - 0.5 * r * r / S
             weights[q, k] = t
             top = max(top, t)
     total = 0.0
     for q in range(COUNT):
         for k in range(K):
             t = weights[q, k] - top
-            weights[q, k] = math.exp(t) if t > _LEAST else 0.0
-            total += weights[q, k]
+            if t > _LEAST:
+                S = at[2, q] * at[2, q] * _SQUARE + at[1, q] + R * multiple[k]
+                weights[q, k] = math.exp(t) / math.sqrt(S)
+                total += weights[q, k]
+            else:
+                weights[q, k] = 0.0
+    scale = 1.0 / total
     for q in range(COUNT):
         for k in range(K):
-            weights[q, k] /= total
+            weights[q, k] *= scale
     return top + math.log(total)
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def _given_output(q, y, noise, at):
-    """Component q given y: variance of y, regression of xi on y, mean and variance of xi.
+    """Component q given y: inverse variance of y, regression of xi on y, mean and variance of xi.
 
     noise: variance of the measurement noise.
     """
     slope = at[2, q]
-    S = slope * slope * _SQUARE + at[1, q] + noise
-    along = _SQUARE * slope / S
-    return S, along, NODES[q] + along * (y - at[0, q]), _SQUARE * (1.0 - along * slope)
+    inverse = 1.0 / (slope * slope * _SQUARE + at[1, q] + noise)
+    along = _SQUARE * slope * inverse
+    return inverse, along, NODES[q] + along * (y - at[0, q]), _SQUARE * (1.0 - along * slope)
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def _moments(y, R, multiple, at, weights):
     """Mean and variance of xi given y."""
     K = multiple.shape[0]
     mean = 0.0
+    second = 0.0
     for q in range(COUNT):
         for k in range(K):
-            if weights[q, k] > 0.0:
-                mean += weights[q, k] * _given_output(q, y, R * multiple[k], at)[2]
-    variance = 0.0
-    for q in range(COUNT):
-        for k in range(K):
-            if weights[q, k] > 0.0:
+            weight = weights[q, k]
+            if weight > 0.0:
                 _, _, first, spread = _given_output(q, y, R * multiple[k], at)
-                variance += weights[q, k] * (spread + (first - mean) ** 2)
+                mean += weight * first
+                second += weight * (spread + first * first)
+    # No variance is lost in rounding that matters: 1 - variance is what counts.
+    variance = second - mean * mean
     return mean, variance
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def function_terms(i, y, R, centre, p, layout, values, work):
     """Value l, alpha = dl/dc and beta = -d^2 l/dc^2 of the log-density of y = f(g) + e.
 
@@ -157,7 +172,7 @@ def function_terms(i, y, R, centre, p, layout, values, work):
     return l - _HALF_LOG_2PI, mean / root, (1.0 - variance) / p
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def function_adjoint(i, y, R, centre, p, layout, values, bars, work, alpha_bar, beta_bar):
     """Reverse of `function_terms` where l counts once: adds to bars of the function.
 
@@ -176,9 +191,12 @@ def function_adjoint(i, y, R, centre, p, layout, values, bars, work, alpha_bar, 
     p_bar = -0.5 * alpha_bar * mean / (p * root) - beta_bar * beta / p
     R_bar = 0.0
     y_bar = 0.0
-    f_bar = np.zeros(COUNT)
-    v_bar = np.zeros(COUNT)
-    slope_bar = np.zeros(COUNT)
+    curve_bar = work.curve_bar
+    work.at_bar[:] = 0.0
+    curve_bar[:] = 0.0
+    f_bar = work.at_bar[0]
+    v_bar = work.at_bar[1]
+    slope_bar = work.at_bar[2]
     K = layout.multiple.shape[0]
     level = mean_bar * mean + second_bar * (variance + mean * mean)  # what weights have in common
     for q in range(COUNT):
@@ -188,24 +206,21 @@ def function_adjoint(i, y, R, centre, p, layout, values, bars, work, alpha_bar, 
             weight = weights[q, k]
             if weight == 0.0:
                 continue
-            S, along, first, spread = _given_output(q, y, R * layout.multiple[k], at)
+            inverse, along, first, spread = _given_output(q, y, R * layout.multiple[k], at)
             term_bar = weight * (
                 1.0 + mean_bar * first + second_bar * (spread + first * first) - level
             )
             first_bar = weight * (mean_bar + 2.0 * second_bar * first)
             spread_bar = weight * second_bar
             along_bar = first_bar * r - spread_bar * _SQUARE * s
-            S_bar = -along_bar * along / S + 0.5 * term_bar * (r * r / S - 1.0) / S
-            r_bar = first_bar * along - term_bar * r / S
-            slope_bar[q] += (
-                along_bar * _SQUARE / S - spread_bar * _SQUARE * along + S_bar * 2.0 * s * _SQUARE
-            )
+            S_bar = (0.5 * term_bar * (r * r * inverse - 1.0) - along_bar * along) * inverse
+            r_bar = first_bar * along - term_bar * r * inverse
+            slope_bar[q] += _SQUARE * (along_bar * inverse - spread_bar * along + 2.0 * S_bar * s)
             v_bar[q] += S_bar
             R_bar += S_bar * layout.multiple[k]
             f_bar[q] -= r_bar
             y_bar += r_bar
     f = work.curve
-    curve_bar = np.zeros(COUNT + 4)
     for q in range(COUNT):
         bend = f[q] - 2.0 * f[q + 2] + f[q + 4]
         bend_bar = f_bar[q] / 6.0 + v_bar[q] * bend / 9.0
@@ -214,34 +229,41 @@ def function_adjoint(i, y, R, centre, p, layout, values, bars, work, alpha_bar, 
         curve_bar[q + 2] += f_bar[q] - 2.0 * bend_bar
         curve_bar[q + 4] += bend_bar + slope
     centre_bar = 0.0
-    row = layout.f_start[i]
-    grid = values.table_mean.shape[1]
+    mean_row = values.table_mean[layout.f_start[i]]
+    variance_row = values.table_variance[layout.f_start[i]]
+    mean_bars = bars.table_mean[layout.f_start[i]]
+    variance_bars = bars.table_variance[layout.f_start[i]]
+    start, stride = _ruler(i, values, centre, root)
+    scale = 1.0 / values.spacing[i]
+    spacing_bar = 0.0
+    root_bar = 0.0
     for j in range(COUNT + 4):
-        xi = SPACING * (j - REACH - 2)
-        z = centre + root * xi
-        k = locate(z, values.low[i], values.spacing[i], grid, w4, s4)
-        variance = 0.0
+        own_bar = v_bar[j - 2] if 2 <= j < COUNT + 2 else 0.0
+        if curve_bar[j] == 0.0 and own_bar == 0.0:
+            continue  # no component near by has any weight
+        t = start + stride * j
+        k, u, inside = place(t, mean_row.shape[0])
+        _, slope = cubic(mean_row, k, u)
+        t_bar = curve_bar[j] * slope
+        cubic_weights(u, w4, s4)
         for b in range(4):
-            variance += w4[b] * values.table_variance[row, k + b]
-        # Where a negative variance was cut off, and beside the components, there is no gradient.
-        own_bar = v_bar[j - 2] if 2 <= j < COUNT + 2 and variance > 0.0 else 0.0
-        z_bar = 0.0
-        for b in range(4):
-            bars.table_mean[row, k + b] += curve_bar[j] * w4[b]
-            bars.table_variance[row, k + b] += own_bar * w4[b]
-            z_bar += s4[b] * (
-                curve_bar[j] * values.table_mean[row, k + b]
-                + own_bar * values.table_variance[row, k + b]
-            )
-        # The grid itself may move: f depends on (z - low) / spacing.
-        bars.low[i] -= z_bar
-        bars.spacing[i] -= z_bar * (z - values.low[i]) / values.spacing[i]
+            mean_bars[k + b] += curve_bar[j] * w4[b]
+        variance, slope = cubic(variance_row, k, u)
+        if variance > 0.0:  # where a negative one was cut off there is no gradient
+            t_bar += own_bar * slope
+            for b in range(4):
+                variance_bars[k + b] += own_bar * w4[b]
+        # t = (centre + root xi - low) / spacing; the grid itself may move.
+        z_bar = t_bar * inside * scale
         centre_bar += z_bar
-        p_bar += 0.5 * z_bar * xi / root
-    return y_bar, R_bar, centre_bar, p_bar
+        spacing_bar -= z_bar * t
+        root_bar += z_bar * SPACING * (j - REACH - 2)
+    bars.low[i] -= centre_bar
+    bars.spacing[i] += spacing_bar
+    return y_bar, R_bar, centre_bar, p_bar + 0.5 * root_bar / root
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def function_moments(i, centre, p, layout, values, work):
     """Mean and variance of f(g) for g ~ N(centre, p)."""
     _evaluate(i, layout, values, centre, math.sqrt(p), work)

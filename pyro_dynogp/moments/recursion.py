@@ -23,7 +23,7 @@ import math
 import numpy as np
 from numba import njit
 
-from pyro_dynogp._compiled_cache import OPTIONS
+from pyro_dynogp._compiled_cache import BORROWING, INLINED, OPTIONS
 from pyro_dynogp.moments.blocks import FLOOR, Values, append, append_adjoint, workspace
 from pyro_dynogp.moments.measured_function import function_adjoint, function_terms
 
@@ -31,63 +31,55 @@ SEGMENT = 64
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
-@njit(**OPTIONS)
-def noise_terms(r, s, R, share, multiple):
-    """Value l, alpha = -dl/dr and beta = -d^2 l/dr^2 of the log-density of a residual."""
-    top = -np.inf
+@njit(**BORROWING)
+def _log_term(r, S, share):
+    return math.log(share) - 0.5 * math.log(S) - 0.5 * r * r / S
+
+
+@njit(**BORROWING)
+def _noise_weights(r, s, R, share, multiple):
+    """Largest logarithm of the components' densities, sum beside it, E 1/S and E 1/S^2 by them."""
     K = share.shape[0]
+    top = -np.inf
     for k in range(K):
-        S = s + R * multiple[k]
-        t = math.log(share[k]) - 0.5 * math.log(S) - 0.5 * r * r / S
-        top = max(top, t)
+        top = max(top, _log_term(r, s + R * multiple[k], share[k]))
     total = 0.0
     first = 0.0
     second = 0.0
     for k in range(K):
         S = s + R * multiple[k]
-        t = math.log(share[k]) - 0.5 * math.log(S) - 0.5 * r * r / S
-        weight = math.exp(t - top)
+        inverse = 1.0 / S
+        weight = math.exp(_log_term(r, S, share[k]) - top)
         total += weight
-        first += weight / S
-        second += weight / (S * S)
-    first /= total
-    second /= total
+        first += weight * inverse
+        second += weight * inverse * inverse
+    return top, total, first / total, second / total
+
+
+@njit(**BORROWING)
+def noise_terms(r, s, R, share, multiple):
+    """Value l, alpha = -dl/dr and beta = -d^2 l/dr^2 of the log-density of a residual."""
+    top, total, first, second = _noise_weights(r, s, R, share, multiple)
     beta = first - r * r * (second - first * first)
     return top + math.log(total) - 0.5 * _LOG_2PI, r * first, beta
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def noise_adjoint(r, s, R, share, multiple, l_bar, alpha_bar, beta_bar):
     """Gradients of `noise_terms` by r, s and R."""
-    K = share.shape[0]
-    weights = np.empty(K)
-    inverse = np.empty(K)
-    top = -np.inf
-    for k in range(K):
-        S = s + R * multiple[k]
-        inverse[k] = 1.0 / S
-        weights[k] = math.log(share[k]) - 0.5 * math.log(S) - 0.5 * r * r / S
-        top = max(top, weights[k])
-    total = 0.0
-    for k in range(K):
-        weights[k] = math.exp(weights[k] - top)
-        total += weights[k]
-    first = 0.0
-    second = 0.0
-    for k in range(K):
-        weights[k] /= total
-        first += weights[k] * inverse[k]
-        second += weights[k] * inverse[k] * inverse[k]
+    top, total, first, second = _noise_weights(r, s, R, share, multiple)
     r_bar = alpha_bar * first - 2.0 * beta_bar * r * (second - first * first)
     first_bar = alpha_bar * r + beta_bar * (1.0 + 2.0 * r * r * first)
     second_bar = -beta_bar * r * r
     mean_bar = first_bar * first + second_bar * second
     s_bar = 0.0
     R_bar = 0.0
-    for k in range(K):
-        a = inverse[k]
-        inverse_bar = weights[k] * (first_bar + 2.0 * second_bar * a)
-        term_bar = weights[k] * (first_bar * a + second_bar * a * a - mean_bar + l_bar)
+    for k in range(share.shape[0]):
+        S = s + R * multiple[k]
+        a = 1.0 / S
+        weight = math.exp(_log_term(r, S, share[k]) - top) / total
+        inverse_bar = weight * (first_bar + 2.0 * second_bar * a)
+        term_bar = weight * (first_bar * a + second_bar * a * a - mean_bar + l_bar)
         S_bar = -a * a * inverse_bar + 0.5 * a * term_bar * (r * r * a - 1.0)
         r_bar -= term_bar * r * a
         s_bar += S_bar
@@ -95,7 +87,7 @@ def noise_adjoint(r, s, R, share, multiple, l_bar, alpha_bar, beta_bar):
     return r_bar, s_bar, R_bar
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def dot(a, b):
     """Inner product."""
     total = 0.0
@@ -104,7 +96,7 @@ def dot(a, b):
     return total
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def covary(P, h, c):
     """Write P h to c."""
     n = h.shape[0]
@@ -117,7 +109,7 @@ def covary(P, h, c):
                 c[i] += P[j, i] * hj
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def update(P, m, c, alpha, beta):
     """M <- m + alpha c, P <- P - beta c c'."""
     n = c.shape[0]
@@ -128,16 +120,16 @@ def update(P, m, c, alpha, beta):
             P[i, j] -= t * c[j]
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def move(re, im, gamma, Q, m, P, T):
     """State mean and covariance one step on, in place in the first N entries of m and P.
 
     T (N, A) is scratch: on return T = F P with F = [Phi gamma], for the old P.
     """
     N = gamma.shape[0]
-    E = gamma.shape[1]
+    A = m.shape[0]
+    E = A - N
     pairs = N // 2
-    A = N + E
     for j in range(pairs):
         a = re[j]
         b = im[j]
@@ -167,7 +159,7 @@ def move(re, im, gamma, Q, m, P, T):
                 P[i, j] += T[i, N + f] * gamma[j, f]
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def enter(time, layout, values, m, P, T):
     """Move to sample `time`."""
     k = layout.step[time]
@@ -175,7 +167,7 @@ def enter(time, layout, values, m, P, T):
         move(values.re[k], values.im[k], values.gamma[k], values.Q[k], m, P, T)
 
 
-@njit(**OPTIONS)
+@njit(**INLINED)
 def seen(o, layout, values):
     """Row (A,) of what output o is measured through: its own, or that of the function's input."""
     if layout.measured >= 0:
@@ -183,10 +175,10 @@ def seen(o, layout, values):
     return values.H[o]
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def output_terms(time, o, layout, values, m, P, c, work):
     """Write the covariance c of a with what output o is measured through; l, alpha and beta."""
-    h = seen(o, layout, values)
+    h = seen(o, layout, values)[: m.shape[0]]
     covary(P, h, c)
     y = values.y[time, o] - values.y_offset[time, o]
     R = values.R[time, o]
@@ -197,7 +189,7 @@ def output_terms(time, o, layout, values, m, P, c, work):
     return noise_terms(y - dot(h, m), dot(h, c), R, layout.share, layout.multiple)
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def measure(time, layout, values, m, P, c, work, alphas, betas):
     """Use the outputs of one sample; the sum of their log-densities is returned.
 
@@ -213,10 +205,16 @@ def measure(time, layout, values, m, P, c, work, alphas, betas):
     return total
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def inner(layout):
     """How many static layers the state, or an output's own row, needs."""
     return layout.measured if layout.measured >= 0 else layout.channels.shape[0]
+
+
+@njit(**BORROWING)
+def width(layout, values):
+    """Length of [x; f] where only the static layers that `inner` counts are appended."""
+    return values.m0.shape[0] + layout.f_start[inner(layout)]
 
 
 @njit(**OPTIONS)
@@ -227,7 +225,7 @@ def run(layout, values):
     """
     n = layout.step.shape[0]
     N = values.m0.shape[0]
-    A = values.G.shape[1]
+    A = width(layout, values)
     segments = (n + SEGMENT - 1) // SEGMENT
     means = np.empty((segments, N))
     covariances = np.empty((segments, N, N))
@@ -249,21 +247,25 @@ def run(layout, values):
         for i in range(inner(layout)):
             append(i, time, layout, values, m, P, work)
         total += measure(time, layout, values, m, P, c, work, alphas, betas)
+    last_m = np.zeros(values.G.shape[1])
+    last_P = np.zeros((last_m.shape[0], last_m.shape[0]))
+    last_m[:A] = m
+    last_P[:A, :A] = P
     for i in range(inner(layout), layout.channels.shape[0]):
-        append(i, n - 1, layout, values, m, P, work)
-    return total, means, covariances, m, P
+        append(i, n - 1, layout, values, last_m, last_P, work)
+    return total, means, covariances, last_m, last_P
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def _move_adjoint(k, layout, values, bars, m, P, m_bar, P_bar, T, T_bar):
     """Reverse of `move` over step k: m, P are those before it; the bars change in place."""
     re = values.re[k]
     im = values.im[k]
     gamma = values.gamma[k]
     N = gamma.shape[0]
-    E = gamma.shape[1]
+    A = m.shape[0]
+    E = A - N
     pairs = N // 2
-    A = N + E
     for i in range(N):
         for j in range(N):
             bars.Q[k, i, j] += P_bar[i, j]
@@ -291,20 +293,18 @@ def _move_adjoint(k, layout, values, bars, m, P, m_bar, P_bar, T, T_bar):
             for j in range(N):
                 total += P_bar[i, j] * gamma[j, f]
             T_bar[i, N + f] = total
-    # F_bar = m_bar m' + 2 P_bar F P = m_bar m' + 2 P_bar T.
+    # F_bar = m_bar m' + 2 P_bar F P = m_bar m' + 2 P_bar T; P_bar is symmetric.
     for j in range(pairs):
         q = pairs + j
-        rr = m_bar[j] * m[j]
-        qq = m_bar[q] * m[q]
-        rq = m_bar[j] * m[q]
-        qr = m_bar[q] * m[j]
-        for i in range(N):
-            rr += 2.0 * P_bar[j, i] * T[i, j]
-            qq += 2.0 * P_bar[q, i] * T[i, q]
-            rq += 2.0 * P_bar[j, i] * T[i, q]
-            qr += 2.0 * P_bar[q, i] * T[i, j]
-        bars.re[k, j] += rr + qq
-        bars.im[k, j] += qr - rq
+        bars.re[k, j] += m_bar[j] * m[j] + m_bar[q] * m[q]
+        bars.im[k, j] += m_bar[q] * m[j] - m_bar[j] * m[q]
+    for i in range(N):
+        for j in range(pairs):
+            q = pairs + j
+            x = 2.0 * P_bar[i, j]
+            w = 2.0 * P_bar[i, q]
+            bars.re[k, j] += x * T[i, j] + w * T[i, q]
+            bars.im[k, j] += w * T[i, j] - x * T[i, q]
     for f in range(E):
         for j in range(N):
             total = m_bar[j] * m[N + f]
@@ -332,14 +332,14 @@ def _move_adjoint(k, layout, values, bars, m, P, m_bar, P_bar, T, T_bar):
         m_bar[q] = re[j] * m_bar[q] - im[j] * x
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def _measure_adjoint(time, layout, values, bars, m, P, m_bar, P_bar, C, alphas, betas, c_bar, work):
     """Reverse of `measure`: m and P go back to what they were, bars change in place."""
     A = m.shape[0]
     for o in range(values.y.shape[1] - 1, -1, -1):
         if math.isnan(values.y[time, o]):
             continue
-        h = seen(o, layout, values)
+        h = seen(o, layout, values)[:A]
         c = C[o]
         update(P, m, c, -alphas[o], -betas[o])
         covary(P_bar, c, c_bar)
@@ -383,7 +383,7 @@ def _measure_adjoint(time, layout, values, bars, m, P, m_bar, P_bar, C, alphas, 
             t = c_bar[j]
             hj = 0.5 * h[j]
             for i in range(A):
-                h_bar[i] += P[i, j] * t
+                h_bar[i] += P[j, i] * t
                 P_bar[j, i] += 0.5 * t * h[i] + hj * c_bar[i]
 
 
@@ -393,7 +393,7 @@ def run_adjoint(layout, values, bars, means, covariances):
     n = layout.step.shape[0]
     n_y = values.y.shape[1]
     N = values.m0.shape[0]
-    A = values.G.shape[1]
+    A = width(layout, values)
     S = inner(layout)
     m = np.zeros(A)
     P = np.zeros((A, A))
@@ -445,7 +445,7 @@ def run_adjoint(layout, values, bars, means, covariances):
                 if time == last - 1:  # not measured above
                     _, alpha[o], beta[o] = output_terms(time, o, layout, values, m, P, C[o], work)
                 else:
-                    covary(P, seen(o, layout, values), C[o])
+                    covary(P, seen(o, layout, values)[:A], C[o])
                 update(P, m, C[o], alpha[o], beta[o])
             if time < n - 1:
                 k = layout.step[time + 1]

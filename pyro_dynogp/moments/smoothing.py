@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numba import njit
 
-from pyro_dynogp._compiled_cache import OPTIONS
+from pyro_dynogp._compiled_cache import BORROWING, OPTIONS
 from pyro_dynogp.moments.blocks import FLOOR, append, workspace
 from pyro_dynogp.moments.measured_function import function_moments, function_terms
 from pyro_dynogp.moments.recursion import (
@@ -30,13 +30,13 @@ from pyro_dynogp.moments.recursion import (
 )
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def _quadratic(P, h, c):
     covary(P, h, c)
     return dot(h, c)
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def _noise_free(time, o, layout, values, centre, p, work):
     """Mean and variance of an output without its noise.
 
@@ -51,7 +51,7 @@ def _noise_free(time, o, layout, values, centre, p, work):
     return mean + values.y_offset[time, o], variance
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def _predict(time, o, layout, values, centre, p, work, found):
     """Write what `_noise_free` returns, and the log-density of the measured output."""
     found[0], found[1] = _noise_free(time, o, layout, values, centre, p, work)
@@ -120,7 +120,7 @@ def predict_ahead(layout, values, horizon):
     return found[0], found[1], found[2]
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def _before_outputs(time, layout, values, bar, L, work, C, alphas, betas, m, P, t, cavity):
     """Take lambda (A,) and Lambda (A, A) back over the outputs of a sample, undone in m and P.
 
@@ -159,7 +159,7 @@ def _before_outputs(time, layout, values, bar, L, work, C, alphas, betas, m, P, 
                 L[j, k] += both * h[j] * h[k] - betas[o] * (h[j] * t[k] + t[j] * h[k])
 
 
-@njit(**OPTIONS)
+@njit(**BORROWING)
 def _before_layer(i, layout, values, bar, L, work, row):
     """Take lambda and Lambda back over static layer i: its outputs lean on what they come from."""
     N = values.m0.shape[0]
