@@ -2,13 +2,14 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import pyro_dynogp as dgp
 from tests.benchmarks.paper import bound, ours, run
-from tests.benchmarks.paper.experiments import EXPERIMENTS
+from tests.benchmarks.paper.experiments import CIRCUIT_VARIABLE, EXPERIMENTS
 from tests.benchmarks.paper.page import number, page, spread
 from tests.benchmarks.paper.prediction import Predicted, scores
 
@@ -66,6 +67,23 @@ def test_electricity_has_the_papers_inputs():
     whole = np.concatenate([train.inputs[:, 2], tests["test"].inputs[:, 2]])
     days = np.arange(len(whole)) / 48.0
     np.testing.assert_allclose(whole, np.cos(2.0 * np.pi * days), atol=1e-9)
+
+
+def test_several_training_records(monkeypatch):
+    experiment = EXPERIMENTS["drives_2"]
+    train, tests, clean = experiment.load(0)
+    several = replace(experiment, load=lambda seed: ((train, train[:100]), tests, clean))
+    task, _, _ = several.task(0)
+    assert [len(record) for record in task.records] == [len(train), 100]
+    assert isinstance(experiment.task(0)[0].records, dgp.Record)
+    monkeypatch.delenv(CIRCUIT_VARIABLE, raising=False)
+    assert not any(job[0] == "circuit_ten" for job in run.jobs())
+    with pytest.raises(FileNotFoundError, match=CIRCUIT_VARIABLE):
+        EXPERIMENTS["circuit_ten"].load(0)
+    monkeypatch.setenv(CIRCUIT_VARIABLE, "/nowhere")
+    assert ("circuit_ten", "pyro_dynogp", 0) in run.jobs()
+    with pytest.raises(FileNotFoundError, match="expected a folder"):
+        EXPERIMENTS["circuit_ten"].load(0)
 
 
 def row(experiment, method, seed, rmse, **more):

@@ -34,8 +34,6 @@ DRAWS = 1000
 # Widest standard deviation of a Laplace approximation, in unconstrained units, where the density
 # is flat: priors are about as wide.
 WIDEST = 1.5
-# Particles of an annealed posterior.
-PARTICLES = 400
 # Samples times draws that are evaluated at once.
 AT_ONCE = 4_000_000
 
@@ -187,8 +185,7 @@ def _annealed(
             "parameters='mode'.",
         )
     normal = normal_of(fit)
-    particles = min(count, PARTICLES)
-    z, start = annealing.around(normal, particles, seed)
+    z, start = annealing.around(normal, count, seed)
     target = annealing.Joint(fit.model.collapsed, (_argument(fit.records),), normal.sites)
     with seeded(seed):
         annealed = annealing.anneal(z, start, target, seed=seed, progress=progress)
@@ -197,7 +194,7 @@ def _annealed(
         values,
         log_joint(fit, values),
         None,
-        np.zeros(particles, dtype=int),
+        np.zeros(count, dtype=int),
         f"annealed from {own.kind}, whose own Pareto k is {shape}",
         annealed.ancestor,
     )

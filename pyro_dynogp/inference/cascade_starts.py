@@ -327,7 +327,7 @@ class _Dynamic:
     def response(self, values: Values, record: Record, x: Tensor) -> Tensor:
         """Mean trajectory (n, w) of the layer."""
         with torch.no_grad(), pyro.poutine.block():
-            sample = pyro.poutine.condition(self.model._sample_dynamic, data=values)
+            sample = pyro.poutine.condition(self.model.sample_dynamic_layer, data=values)
             modes = sample(self.one, self.layer, TimeScale.of(self.scaling)).modes
             out = mean_response(modes, record.time, x if modes.inputs else None).output
         return out if modes.several_outputs else out.unsqueeze(-1)
@@ -399,7 +399,7 @@ def _static(
 
 def _function(model: Cascade, one: Wire, layer: Static, values: Values) -> StaticFunction:
     with torch.no_grad(), pyro.poutine.block():
-        sample = pyro.poutine.condition(model._sample_static, data=values)
+        sample = pyro.poutine.condition(model.sample_static_layer, data=values)
         return sample(one, layer).function
 
 

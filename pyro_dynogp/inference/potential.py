@@ -72,6 +72,9 @@ def denormals_flushed() -> Iterator[None]:
 class Potential:
     """Sites of a model given its arguments, and its log joint density.
 
+    `nearly_normal` says whether the density is so close to normal that Laplace's approximation at
+    the mode is all the preparation that chains need.
+
     Args:
         model: a Pyro function. args: what it is called with.
         values: a value for every latent site, at which the model is traced once.
@@ -79,6 +82,8 @@ class Potential:
     Raises:
         ValueError: where a latent site has no value.
     """
+
+    nearly_normal = False
 
     def __init__(
         self, model: Callable[..., Any], args: tuple[Any, ...], values: Mapping[str, Tensor]
@@ -158,14 +163,17 @@ class Potential:
 
     def hessian(self, z: np.ndarray, *, step: float = 1e-4) -> np.ndarray:
         """Hessian (d, d) of the energy with Jacobian, by central differences of the gradient."""
-        d = z.shape[0]
-        H = np.empty((d, d))
-        for i in range(d):
-            shift = np.zeros(d)
+        return self.hessian_of(z, range(z.shape[0]), step=step)
+
+    def hessian_of(self, z: np.ndarray, some: Sequence[int], *, step: float = 1e-4) -> np.ndarray:
+        """Rows and columns of `hessian` that belong to some entries of z."""
+        H = np.empty((len(some), len(some)))
+        for row, i in enumerate(some):
+            shift = np.zeros(z.shape[0])
             shift[i] = step
             up = self.value_and_gradient(z + shift, jacobian=True)[1]
             down = self.value_and_gradient(z - shift, jacobian=True)[1]
-            H[i] = (up - down) / (2.0 * step)
+            H[row] = (up - down)[list(some)] / (2.0 * step)
         return 0.5 * (H + H.T)
 
     def log_evidence(self, values: Mapping[str, Tensor], *, widest: float) -> float:

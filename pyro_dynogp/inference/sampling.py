@@ -14,7 +14,7 @@ from pyro.infer import MCMC, NUTS
 from pyro.ops.stats import effective_sample_size, split_gelman_rubin
 from torch import Tensor
 
-from pyro_dynogp.inference.potential import Potential
+from pyro_dynogp.inference.coordinates import potential_for_sampling
 from pyro_dynogp.parallel import child_seeds, parallel_map, seeded
 from pyro_dynogp.record import Record
 
@@ -54,9 +54,9 @@ class _Task:
 
 
 def _run_chain(task: _Task) -> tuple[Tensor, int]:
-    """Unconstrained draws (draws, d) and the number of divergences of one chain."""
+    """Draws (draws, d) in the potential's coordinates, and how many moves of a chain diverged."""
     with seeded(task.seed):
-        potential = Potential(task.model, (task.records,), task.values)
+        potential = potential_for_sampling(task.model, (task.records,), task.values)
         centre, root = torch.tensor(task.centre), torch.tensor(task.root)
 
         def energy(parameters: dict[str, Tensor]) -> Tensor:
@@ -73,7 +73,10 @@ def _run_chain(task: _Task) -> tuple[Tensor, int]:
             potential_fn=energy,
             target_accept_prob=task.target_accept,
             max_tree_depth=8,
-            full_mass=True,
+            # The first windows of the adaptation have fewer draws than there are dimensions: where
+            # the coordinates are good already it only makes them worse (tenfold steps).
+            adapt_mass_matrix=not potential.nearly_normal,
+            full_mass=not potential.nearly_normal,
         )
         mcmc = MCMC(
             kernel,
@@ -118,11 +121,12 @@ def sample_posterior(
 ) -> Chains:
     """Run NUTS from around the posterior mode `values`.
 
-    Coordinates are whitened by the Laplace approximation at the mode, and by a dense mass matrix
-    that warm-up adapts; each chain starts at a draw of that approximation, or between it and the
-    mode (`within_reach`).
+    Coordinates are whitened by the Laplace approximation at the mode. Those of a cascade are the
+    ones of `coordinates`; other models have a dense mass matrix, which warm-up adapts, besides.
+    Each chain starts at a draw of the approximation, or between it and the mode
+    (`within_reach`).
     """
-    potential = Potential(model, (records,), values)
+    potential = potential_for_sampling(model, (records,), values)
     z, root = potential.laplace(values, widest=3.0)
     tasks = [
         _Task(
@@ -140,8 +144,9 @@ def sample_posterior(
         for i, child in enumerate(child_seeds(seed, chains))
     ]
     results = parallel_map(_run_chain, tasks, workers=workers)
-    unconstrained = torch.stack([x for x, _ in results])
-    sites = {k: v.detach() for k, v in potential.unpack(unconstrained).items()}
+    drawn = torch.stack([x for x, _ in results])
+    with torch.no_grad():
+        sites = {k: v.contiguous() for k, v in potential.unpack(drawn).items()}
     several = chains > 1
     return Chains(
         draws=sites,

@@ -113,7 +113,7 @@ class StaticFunction:
         return broadcast(self.kernel.batch_shape, *(x.shape[: x.dim() - k] for x, k in pairs))
 
     @cached_property
-    def _root(self) -> Tensor:
+    def root(self) -> Tensor:
         """Cholesky factor L (*b, M, M)."""
         K = self.kernel(self.locations, self.locations)
         level = K.diagonal(dim1=-2, dim2=-1).mean(-1)
@@ -123,13 +123,13 @@ class StaticFunction:
     def inducing_values(self) -> Tensor:
         """Inducing values u (*b, e, M)."""
         return self.prior_mean(self.locations).mT + self.output_scale.unsqueeze(-1) * (
-            self.whitened @ self._root.mT
+            self.whitened @ self.root.mT
         )
 
     @cached_property
     def weights(self) -> Tensor:
         """Weights alpha (*b, e, M), scale included: mean(x) = prior_mean(x) + k(x, Z) alpha'."""
-        return self.output_scale.unsqueeze(-1) * _solve(self._root.mT, self.whitened.mT, True).mT
+        return self.output_scale.unsqueeze(-1) * _solve(self.root.mT, self.whitened.mT, True).mT
 
     def prior_mean(self, x: Tensor) -> Tensor:
         """Prior mean mu (*b, n, e) at points x (*b, n, d)."""
@@ -151,7 +151,7 @@ class StaticFunction:
         """`mean` and `variance` at points x (*b, n, d), for the cost of one kernel evaluation."""
         prior_mean = self.prior_mean(x)
         K = self.kernel(x, self.locations)
-        explained = _solve(self._root, K.mT).square().sum(-2)
+        explained = _solve(self.root, K.mT).square().sum(-2)
         share = (self.kernel.diagonal(x) - explained).clamp_min(0.0)
         variance = share.unsqueeze(-1) * self.output_scale.square().unsqueeze(-2)
         mean = prior_mean + K @ self.weights.mT
@@ -197,13 +197,13 @@ class StaticFunction:
         self._check_points("x", x)
         self._check_points("support", support)
         _check_shape("residual", residual, self.outputs, support.shape[-2])
-        A = _solve(self._root, self.kernel(self.locations, support))
+        A = _solve(self.root, self.kernel(self.locations, support))
         K = self.kernel(support, support)
         level = K.diagonal(dim1=-2, dim2=-1).mean(-1)
         root = _cholesky(K - A.mT @ A, level, f"{self.name}: the covariance of the residual")
         # Coefficients of k(x, support), and of k(x, Z) for what the support shares with Z.
         own = _solve(root.mT, residual.mT, True)
-        shared = _solve(self._root.mT, A @ own, True)
+        shared = _solve(self.root.mT, A @ own, True)
         scale = self.output_scale.unsqueeze(-2)
         drawn = self.kernel(x, support) @ (scale * own)
         given = self.kernel(x, self.locations) @ (self.weights.mT - scale * shared)

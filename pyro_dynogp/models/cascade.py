@@ -286,9 +286,9 @@ class Cascade:
         systems: list[DynamicSystem | StaticSystem] = []
         for one in self.wires:
             if isinstance(one.layer, Dynamic):
-                systems.append(self._sample_dynamic(one, one.layer, time_scale))
+                systems.append(self.sample_dynamic_layer(one, one.layer, time_scale))
             else:
-                systems.append(self._sample_static(one, one.layer))
+                systems.append(self.sample_static_layer(one, one.layer))
         flat = self.priors == "paper"
         offset = None
         if isinstance(self.layers[-1], Dynamic):
@@ -299,7 +299,10 @@ class Cascade:
         direct = sample_direct(self.direct, self.outputs, flat=flat) if self.direct else None
         return CascadeSystem(self.wires, tuple(systems), noise, offset, direct)
 
-    def _sample_dynamic(self, one: Wire, layer: Dynamic, time_scale: TimeScale) -> DynamicSystem:
+    def sample_dynamic_layer(
+        self, one: Wire, layer: Dynamic, time_scale: TimeScale
+    ) -> DynamicSystem:
+        """Sample the parameters of one dynamic layer."""
         modes = sample_modes(
             one.name,
             inputs=one.channels,
@@ -314,7 +317,8 @@ class Cascade:
         )
         return DynamicSystem(modes, past_input_covariance(modes, 1.0 / time_scale.typical_rate))
 
-    def _sample_static(self, one: Wire, layer: Static) -> StaticSystem:
+    def sample_static_layer(self, one: Wire, layer: Static) -> StaticSystem:
+        """Sample the parameters of one static layer."""
         function = sample_static(
             one.name,
             channels=one.channels,

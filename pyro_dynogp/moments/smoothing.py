@@ -125,10 +125,10 @@ def _before_outputs(time, layout, values, bar, L, work, C, alphas, betas, m, P, 
     """Take lambda (A,) and Lambda (A, A) back over the outputs of a sample, undone in m and P.
 
     Writes to cavity (3, n, n_y) mean and variance of each noise-free output given all data but its
-    own sample, and the sample's log-density. The information of later data does not depend on what
-    the filter knew before: with q = c'Lambda c and l = c'lambda after the update, the Woodbury
-    identity gives the mean m + (l + alpha q)/(1 + beta q) and the variance s - q/(1 + beta q)
-    before it.
+    own sample, and the sample's log-density; not where cavity is empty. The information of later
+    data does not depend on what the filter knew before: with q = c'Lambda c and l = c'lambda after
+    the update, the Woodbury identity gives the mean m + (l + alpha q)/(1 + beta q) and the variance
+    s - q/(1 + beta q) before it.
     """
     A = bar.shape[0]
     for o in range(values.y.shape[1] - 1, -1, -1):
@@ -141,16 +141,17 @@ def _before_outputs(time, layout, values, bar, L, work, C, alphas, betas, m, P, 
         covary(L, c, t)
         q = dot(c, t)
         kept = 1.0 / (1.0 + betas[o] * q)
-        _predict(
-            time,
-            o,
-            layout,
-            values,
-            dot(h, m) + kept * (along + alphas[o] * q),
-            max(dot(h, c) - kept * q, 0.0),
-            work,
-            cavity[:, time, o],
-        )
+        if cavity.size > 0:
+            _predict(
+                time,
+                o,
+                layout,
+                values,
+                dot(h, m) + kept * (along + alphas[o] * q),
+                max(dot(h, c) - kept * q, 0.0),
+                work,
+                cavity[:, time, o],
+            )
         for j in range(A):
             bar[j] += (alphas[o] - betas[o] * along) * h[j]
         both = betas[o] * (1.0 + betas[o] * q)
@@ -194,8 +195,8 @@ def smooth(layout, values, rows, means, covariances):
 
     means, covariances: what `recursion.run` kept at the segments.
     """
-    mean, variance, _ = _backwards(layout, values, rows, means, covariances)
-    return mean, variance
+    cavity = np.empty((3, 0, values.y.shape[1]))
+    return _backwards(layout, values, rows, means, covariances, cavity)
 
 
 @njit(**OPTIONS)
@@ -205,13 +206,14 @@ def leave_one_out(layout, values, means, covariances):
     NaN where the sample is missing. Exact for linear cascades with Gaussian noise.
     """
     rows = np.empty((0, values.G.shape[1]))
-    _, _, cavity = _backwards(layout, values, rows, means, covariances)
+    cavity = np.full((3, values.y.shape[0], values.y.shape[1]), np.nan)
+    _backwards(layout, values, rows, means, covariances, cavity)
     return cavity[0], cavity[1], cavity[2]
 
 
 @njit(**OPTIONS)
-def _backwards(layout, values, rows, means, covariances):
-    """What `smooth` and `leave_one_out` return, from one pass."""
+def _backwards(layout, values, rows, means, covariances, cavity):
+    """What `smooth` returns; writes what `leave_one_out` does to cavity, unless that is empty."""
     n = layout.step.shape[0]
     n_y = values.y.shape[1]
     N = values.m0.shape[0]
@@ -221,7 +223,6 @@ def _backwards(layout, values, rows, means, covariances):
     pairs = N // 2
     mean = np.empty((n, A))
     variance = np.empty((n, rows.shape[0]))
-    cavity = np.full((3, n, n_y), np.nan)
     m = np.zeros(A)
     P = np.zeros((A, A))
     bar = np.zeros(A)
@@ -306,7 +307,7 @@ def _backwards(layout, values, rows, means, covariances):
             _before_outputs(time, layout, values, bar, L, work, C, alphas, betas, m, P, t, cavity)
             for i in range(S - 1, -1, -1):
                 _before_layer(i, layout, values, bar, L, work, t)
-    return mean, variance, cavity
+    return mean, variance
 
 
 @njit(**OPTIONS)

@@ -37,7 +37,7 @@ def run(folder: Path) -> str:
     del folder
     data = record()
     model = dgp.Wiener(inputs=1, pairs=1, inducing=INDUCING)
-    exact = dgp.fit(model, data, method="nuts", chains=2, draws=500, warmup=400, seed=0)
+    exact = dgp.fit(model, data, method="nuts", chains=4, draws=500, warmup=300, seed=0)
     fits: dict[str, dgp.Fit] = {
         "optima with their weights (default)": dgp.fit(model, data, progress=False),
         "multivariate normal": dgp.fit(

@@ -25,7 +25,7 @@ def interpolating(f, count=41, reach=5.0):
     locations = torch.linspace(-reach, reach, count, dtype=torch.float64).unsqueeze(-1)
     nothing = torch.zeros(1, count, dtype=torch.float64)
     blank = StaticFunction(kernel, locations, nothing, one, 0.0 * one)
-    whitened = torch.linalg.solve_triangular(blank._root, f(locations), upper=False).mT
+    whitened = torch.linalg.solve_triangular(blank.root, f(locations), upper=False).mT
     return replace(blank, whitened=whitened)
 
 

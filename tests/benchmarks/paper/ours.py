@@ -32,7 +32,7 @@ def stacked(task: Task) -> Outcome:
     """Fits of the architecture from several seeds, weighted by their forecasts of training data."""
     begin = time.perf_counter()
     fits = {
-        f"seed {seed}": dgp.fit(cascade_model(task), task.train, seed=seed, progress=False)
+        f"seed {seed}": dgp.fit(cascade_model(task), task.records, seed=seed, progress=False)
         for seed in range(STACKED * task.seed, STACKED * (task.seed + 1))
     }
     table = dgp.compare(fits, target="new record")
@@ -75,9 +75,9 @@ def test_records(task: Task) -> list[dgp.Record]:
     return found
 
 
-def step_seconds(fit: dgp.Fit, record: dgp.Record) -> float:
-    """Value and gradient of the log joint density on the whole record [s], best of three."""
-    potential = Potential(getattr(fit.model, "collapsed", fit.model), (record,), fit.mode)
+def step_seconds(fit: dgp.Fit, records: dgp.Record | tuple[dgp.Record, ...]) -> float:
+    """Value and gradient of the log joint density on all of the data [s], best of three."""
+    potential = Potential(getattr(fit.model, "collapsed", fit.model), (records,), fit.mode)
     z = potential.pack(potential.at).numpy()
     best = np.inf
     for _ in range(3):
@@ -89,12 +89,12 @@ def step_seconds(fit: dgp.Fit, record: dgp.Record) -> float:
 
 def _fitted(model: dgp.Cascade | dgp.LinearDynamicGP, task: Task) -> Outcome:
     begin = time.perf_counter()
-    fit = dgp.fit(model, task.train, seed=task.seed, progress=False)
+    fit = dgp.fit(model, task.records, seed=task.seed, progress=False)
     seconds = time.perf_counter() - begin
     return Outcome(
         _predictions(fit, task),
         seconds,
-        step_seconds=step_seconds(fit, task.train),
+        step_seconds=step_seconds(fit, task.records),
         figures={"noise_sd": float(fit.noise_sd[0])},
     )
 

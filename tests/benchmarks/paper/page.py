@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+import pyro_dynogp as dgp
 from tests.benchmarks.markdown import table
 from tests.benchmarks.paper.bound import clean_error_bound
 from tests.benchmarks.paper.experiments import EXPERIMENTS, Experiment
@@ -132,7 +133,9 @@ LENGTHS: dict[str, int] = {}
 def _length(experiment: str) -> int:
     if experiment not in LENGTHS:
         one = EXPERIMENTS[experiment]
-        LENGTHS[experiment] = len(one.load(one.seeds[0])[0])
+        train = one.load(one.seeds[0])[0]
+        records = (train,) if isinstance(train, dgp.Record) else train
+        LENGTHS[experiment] = sum(len(record) for record in records)
     return LENGTHS[experiment]
 
 

@@ -49,6 +49,8 @@ class Task:
         width: number of signals between layers.
         seconds: most wall time for learning.
         seed: of everything random.
+        more: further training records; only methods that learn from several are given tasks with
+            any.
     """
 
     train: dgp.Record
@@ -60,6 +62,12 @@ class Task:
     width: int
     seconds: float
     seed: int = 0
+    more: tuple[dgp.Record, ...] = ()
+
+    @property
+    def records(self) -> dgp.Record | tuple[dgp.Record, ...]:
+        """All there is to learn from."""
+        return (self.train, *self.more) if self.more else self.train
 
 
 @dataclass(frozen=True, eq=False)
