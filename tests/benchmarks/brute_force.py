@@ -35,7 +35,7 @@ QUIET: dict[str, Any] = {"workers": 1, "progress": False}
 SIZES = {60: 1, 100: 1}
 NOISE = 0.05
 # Of the hook, and of each brute-force fit, whose draws are its own.
-DRAWS, BRUTE_DRAWS, BRUTE_SEED = 1000, 200, 9
+DRAWS, BRUTE_DRAWS, BRUTE_SEED = 1000, 1000, 9
 Again = Callable[[Any, dgp.Record], Any]
 
 

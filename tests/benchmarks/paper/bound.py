@@ -24,9 +24,13 @@ FREQUENCIES = (3.0 * np.pi, 5.0 * np.pi)
 STEP = 0.01
 
 
-def clean_error_bound(seed: int) -> float:
+# A, B, C, L and the standard deviation of the measurement noise.
+System = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]
+
+
+def clean_error_bound(system: System) -> float:
     """Least RMSE against the clean output of the test, over the measurement noise's sd."""
-    A, B, C, L, noise_sd = system(seed)
+    A, B, C, L, noise_sd = system
     time = STEP * np.arange(2500)
     g = response(A, B, C, np.sin(np.outer(time, FREQUENCIES)))
     basis = np.concatenate(
@@ -56,13 +60,18 @@ def response(A: np.ndarray, B: np.ndarray, C: np.ndarray, u: np.ndarray) -> np.n
     return np.array(out)
 
 
-def system(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
-    """A, B, C, L and the measurement noise of a published record, else of our own simulator."""
+def simulated(seed: int) -> System:
+    """A system of our own simulator."""
+    truth = dgp.datasets.load("wiener", seed=seed).truth
+    assert truth is not None
+    return truth.A, truth.B, truth.C, truth.L, truth.noise_sd
+
+
+def published(seed: int) -> System:
+    """The system of a published record where those are, else of our own simulator."""
     folder = os.environ.get(wiener.VARIABLE)
     if folder is None:
-        truth = dgp.datasets.load("wiener", seed=seed).truth
-        assert truth is not None
-        return truth.A, truth.B, truth.C, truth.L, truth.noise_sd
+        return simulated(seed)
     arrays = np.load(Path(folder) / f"seed_{seed}.npz")
     v = arrays["a_v"].ravel()
     A = np.diag(arrays["a_d"].ravel()) - np.outer(v, v)

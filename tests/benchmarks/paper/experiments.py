@@ -14,6 +14,7 @@ import numpy as np
 
 import pyro_dynogp as dgp
 from tests.benchmarks import wiener
+from tests.benchmarks.paper.bound import System, published, simulated
 from tests.benchmarks.paper.prediction import Task
 
 # Training record or records, test records by name, and noise-free outputs of those known.
@@ -38,7 +39,7 @@ class Experiment:
         follows: whether the test comes right after the training record.
         test_process_noise: whether the test period has any; False where the protocol says so.
         seeds: of records (simulated study), else of the methods.
-        simulated: whether a seed is a record of its own.
+        system: of a simulated study, where a seed is a record of its own: what made it.
         targets: what the project set out to reach, by score (of the first test record).
         paper: score -> figures of dynoGP, dynoNet, GP-NARX as published.
         unit: of the output. note: what to know about the protocol.
@@ -54,11 +55,16 @@ class Experiment:
     skip: int = 0
     follows: bool = True
     test_process_noise: bool = True
-    simulated: bool = False
+    system: Callable[[int], System] | None = None
     targets: Mapping[str, float] = field(default_factory=dict)
     paper: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     unit: str = ""
     note: str = ""
+
+    @property
+    def simulated(self) -> bool:
+        """Whether a seed is a record of its own."""
+        return self.system is not None
 
     def task(self, seed: int) -> tuple[Task, dict[str, dgp.Record], dict[str, np.ndarray]]:
         """What a method is given, and what it is scored with."""
@@ -151,7 +157,7 @@ def _electricity(seed: int) -> Loaded:
 
 STUDY = Experiment(
     "simulated Wiener", _wiener, (5, "static"), (True,), seconds=90.0, seeds=tuple(range(10)),
-    test_process_noise=False, simulated=True, targets={"rmse_over_floor": 1.02},
+    test_process_noise=False, system=published, targets={"rmse_over_floor": 1.02},
     note=f"Seeds 0 to 9 of the published records where {wiener.VARIABLE} names their folder, else "
     "of our own simulator; RMSE and CRPS over those of the true predictive distribution.",
 )  # fmt: skip
@@ -160,6 +166,7 @@ EXPERIMENTS = {
     "wiener": STUDY,
     "wiener_own": replace(
         STUDY, name="simulated Wiener, own records", load=_own_wiener, seeds=tuple(range(50)),
+        system=simulated,
         note="Our own simulator of the same study, 50 systems.",
     ),
     "circuit": Experiment(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 
 import pyro_dynogp as dgp
 from tests.benchmarks.markdown import table
-from tests.benchmarks.paper.bound import clean_error_bound
+from tests.benchmarks.paper.bound import System, clean_error_bound
 from tests.benchmarks.paper.experiments import EXPERIMENTS, Experiment
 from tests.benchmarks.paper.figures import experiment_figure, study_figure
 from tests.benchmarks.paper.prediction import OURS
@@ -59,8 +59,8 @@ def _section(key: str, experiment: Experiment, rows: Sequence[Row], folder: Path
         parts.append(_table(experiment, done, name, published=name == names[0]))
     parts.append(_costs(done))
     parts += _targets(experiment, done)
-    if experiment.simulated:
-        parts += _against_peers(done)
+    if experiment.system is not None:
+        parts += _against_peers(done, experiment.system)
     parts += _notes(rows)
     if done:
         draw = study_figure if experiment.simulated else experiment_figure
@@ -166,7 +166,7 @@ RIVALS = (("clean_over_floor", "dynoNet", 0.7), ("first_over_floor", "dynoNet", 
           ("crps_over_floor", "GP-NARX", 1.0))  # fmt: skip
 
 
-def _against_peers(rows: Sequence[Row]) -> list[str]:
+def _against_peers(rows: Sequence[Row], system: Callable[[int], System]) -> list[str]:
     """Seed by seed beside a peer, and beside what can be known at all."""
     found = {(row["method"], row["seed"]): row["scores"]["test"] for row in rows if row["scores"]}
     seeds = sorted(seed for method, seed in found if method == OURS)
@@ -182,7 +182,7 @@ def _against_peers(rows: Sequence[Row]) -> list[str]:
                 f"{spread(np.array(ratios))}, target {number(limit)}."
             )
     if seeds:
-        bounds = np.array([clean_error_bound(seed) for seed in seeds])
+        bounds = np.array([clean_error_bound(system(seed)) for seed in seeds])
         own = np.array([_score(found[OURS, seed], "clean_over_floor") for seed in seeds])
         lines.append(
             f"- Cramer-Rao bound of the clean RMSE / floor, for who knows all but the response to "
