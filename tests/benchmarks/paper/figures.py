@@ -80,9 +80,10 @@ def study_figure(experiment: Experiment, rows: Sequence[Row], folder: Path) -> N
             if "test/crps" in arrays:
                 crps.append(_smooth(arrays["test/crps"]) / floor)
         time = _smooth(record.time)
-        panels[0].plot(time, np.median(errors, 0), color=colour, label=method)
+        label = method if len(errors) == len(known) else f"{method} ({len(errors)} systems)"
+        panels[0].plot(time, np.median(errors, 0), color=colour, label=label)
         if crps:
-            panels[1].plot(time, np.median(crps, 0), color=colour, label=method)
+            panels[1].plot(time, np.median(crps, 0), color=colour, label=label)
     panels[0].set_ylabel("|error| / noise floor")
     panels[1].set_ylabel("CRPS / noise floor")
     panels[1].set_xlabel("time [s]")
