@@ -177,4 +177,5 @@ def test_bound_by_monte_carlo():
     wrong = np.linalg.solve(basis[seen].T @ weighted, weighted.T @ errors)
     off = (basis[1500:] @ wrong)[g[1500:] > 0.0]
     found = np.sqrt(np.square(off).sum() / (1000 * 400)) / noise_sd
+    # 400 replicates of four numbers: a Monte Carlo error of 2 %.
     assert bound.clean_error_bound((A, B, C, L, noise_sd)) == pytest.approx(found, rel=0.05)

@@ -398,9 +398,8 @@ def _static(
 
 
 def _function(model: Cascade, one: Wire, layer: Static, values: Values) -> StaticFunction:
-    with torch.no_grad(), pyro.poutine.block():
-        sample = pyro.poutine.condition(model.sample_static_layer, data=values)
-        return sample(one, layer).function
+    with torch.no_grad():
+        return model.static_given(one, layer, values)
 
 
 def _whiten(function: StaticFunction, u: Tensor) -> Tensor:

@@ -55,19 +55,7 @@ class RelativeToGain:
         one = torch.nn.functional.one_hot(torch.tensor(self.place), ratio.shape[-1]).bool()
         gain = self.sign * s.exp().unsqueeze(-1) * torch.where(one, 1.0, ratio)
         self._put(x, gain, shapes)
-        log_det = ratio.shape[-1] * s
-        for name in self.logs:
-            x[name] = x[name] + s.unsqueeze(-1)
-        for name in self.lengths:
-            x[name] = x[name] * s.exp().unsqueeze(-1)
-            log_det = log_det + x[name].shape[-1] * s
-        if self.local is not None:
-            factor = (s.unsqueeze(-1) - x[self.local])[..., None, None]
-            unit = x[self.unit]
-            x[self.unit] = unit + factor if self.positive else unit * factor.exp()
-            if not self.positive:
-                log_det = log_det + (factor + torch.zeros_like(unit)).flatten(-3).sum(-1)
-        return log_det
+        return ratio.shape[-1] * s + self._rescale(x, s, 1.0)
 
     def backward(self, z: Parts) -> None:
         """As `Step` has it."""
@@ -76,14 +64,24 @@ class RelativeToGain:
         one = torch.nn.functional.one_hot(torch.tensor(self.place), gain.shape[-1]).bool()
         ratio = gain * self.sign * (-s).exp().unsqueeze(-1)
         self._put(z, torch.where(one, s.unsqueeze(-1), ratio), shapes)
+        self._rescale(z, s, -1.0)
+
+    def _rescale(self, values: Parts, s: Tensor, sign: float) -> Tensor:
+        """Multiply by exp(sign s) what is measured in units of the signal; log |det| (*s)."""
+        log_det = torch.zeros_like(s)
+        shift = sign * s.unsqueeze(-1)
         for name in self.logs:
-            z[name] = z[name] - s.unsqueeze(-1)
+            values[name] = values[name] + shift
         for name in self.lengths:
-            z[name] = z[name] * (-s).exp().unsqueeze(-1)
+            values[name] = values[name] * shift.exp()
+            log_det = log_det + values[name].shape[-1] * shift.squeeze(-1)
         if self.local is not None:
-            factor = (s.unsqueeze(-1) - z[self.local])[..., None, None]
-            unit = z[self.unit]
-            z[self.unit] = unit - factor if self.positive else unit * (-factor).exp()
+            unit = values[self.unit]
+            factor = sign * (s.unsqueeze(-1) - values[self.local])[..., None, None]
+            values[self.unit] = unit + factor if self.positive else unit * factor.exp()
+            if not self.positive:
+                log_det = log_det + factor.expand_as(unit).flatten(-3).sum(-1)
+        return log_det
 
     def size(self, z: Parts) -> Tensor:
         """|G_r| (*s) of unconstrained values."""

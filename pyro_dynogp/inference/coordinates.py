@@ -18,10 +18,9 @@ about zero, prior and likelihood are the same, so that nothing is lost but a mir
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-import pyro
 import torch
 from torch import Tensor
 
@@ -53,7 +52,7 @@ class StraightPotential(Potential):
 
     def pack(self, values: Mapping[str, Tensor]) -> Tensor:
         """Constrained values of every site to coordinates (d,)."""
-        z = {site.name: part for site, part in parts(self.sites, super().pack(values))}
+        z = by_name(self.sites, super().pack(values))
         with torch.no_grad():
             for step in reversed(self.steps):
                 step.backward(z)
@@ -71,12 +70,17 @@ class StraightPotential(Potential):
 
     def _unconstrained(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Unconstrained vectors (*s, d), and log |det dz/dx| (*s)."""
-        z = {site.name: part for site, part in parts(self.sites, x)}
+        z = by_name(self.sites, x)
         log_det = torch.zeros(x.shape[:-1], dtype=x.dtype)
         for step in self.steps:
             log_det = log_det + step.forward(z)
         flat = [z[site.name].reshape(*x.shape[:-1], -1) for site in self.sites]
         return torch.cat(flat, -1), log_det
+
+
+def by_name(sites: Sequence[Site], z: Tensor) -> Parts:
+    """The parts (*s, *unconstrained) of vectors z (*s, d)."""
+    return {site.name: part for site, part in parts(sites, z)}
 
 
 def potential_for_sampling(
@@ -90,13 +94,13 @@ def potential_for_sampling(
 
 def steps_of(model: Cascade, plain: Potential) -> list[Step]:
     """The changes of coordinates that a cascade's layers ask for, in the order of `forward`."""
-    by_name = {site.name: site for site in plain.sites}
+    named = {site.name: site for site in plain.sites}
     sizes: dict[str, RelativeToGain] = {}
     for one in model.wires:
-        if isinstance(one.layer, Dynamic) and f"{one.name}_input_gain" in by_name:
+        if isinstance(one.layer, Dynamic) and f"{one.name}_input_gain" in named:
             readers = [other for other in model.wires if one.name in other.sources]
             if one.layer.outputs == 1 and len(readers) == 1:
-                found = _relative(one, readers[0], by_name, plain.at)
+                found = _relative(one, readers[0], named, plain.at)
                 if found is not None:
                     sizes[readers[0].name] = found
     steps: list[Step] = list(sizes.values())
@@ -156,10 +160,9 @@ def _layer(
 
     def function(z: Parts) -> StaticFunction:
         given = {site.name: site.transform(z[site.name]) for site in own}
-        with pyro.poutine.block(), pyro.poutine.condition(data=given):
-            return model.sample_static_layer(one, layer).function
+        return model.static_given(one, layer, given)
 
-    start = {site.name: part for site, part in parts(plain.sites, plain.pack(plain.at))}
+    start = by_name(plain.sites, plain.pack(plain.at))
     fixed = function(start).locations.detach()
     if relative is not None:
         fixed = fixed / relative.size(start)
@@ -173,15 +176,10 @@ def _layer(
 def given_others(name: str, plain: Potential, layer: Layer) -> Step:
     """The coordinates of one static layer from derivatives of the density at the start."""
     z = plain.pack(plain.at)
-    start = 0
-    for site in plain.sites:
-        stop = start + site.unconstrained.numel()
-        if site.name == name:
-            break
-        start = stop
-    hessian = plain.hessian_of(z.numpy(), range(start, stop))
-    gradient = plain.value_and_gradient(z.numpy(), jacobian=True)[1][start:stop]
-    v = z[start:stop]
+    own = by_name(plain.sites, torch.arange(plain.size))[name].flatten().tolist()
+    hessian = plain.hessian_of(z.numpy(), own)
+    gradient = plain.value_and_gradient(z.numpy(), jacobian=True)[1][own]
+    v = z[own]
     # The prior of v is standard normal; the rest of the energy is the likelihood's.
     eigenvalues, vectors = torch.linalg.eigh(torch.tensor(hessian) - torch.eye(len(v)))
     known = torch.where(eigenvalues > LEAST, eigenvalues, 0.0)
@@ -189,7 +187,7 @@ def given_others(name: str, plain: Potential, layer: Layer) -> Step:
     linear = v - torch.tensor(gradient) + by_v @ v
     linear = vectors @ (torch.where(known > 0.0, 1.0, 0.0) * (vectors.mT @ linear))
     with torch.no_grad():
-        mean, W = affine(*layer({site.name: part for site, part in parts(plain.sites, z)}))
+        mean, W = affine(*layer(by_name(plain.sites, z)))
         back = torch.linalg.inv(W)
     precision = back.mT @ by_v @ back
     return GivenOthers(name, layer, precision, back.mT @ linear + precision @ mean)

@@ -94,17 +94,29 @@ def _copy(S, out):
 
 
 @njit(**BORROWING)
-def _factor_row(S, re, im, k, h, g, k0, v, s, e):
-    """Advance the explained covariance S over one row; e is written, the variance p returned."""
+def _move(S, re, im, k):
+    """S <- Phi S Phi' over step k, where there is one."""
     if k >= 0:
         _rotate_rows(S, re[k], im[k])
         _rotate_columns(S, re[k], im[k])
+
+
+@njit(**BORROWING)
+def _use_row(S, h, g, k0, v, s, e):
+    """Explained covariance S after a row's sample; e is written, the variance p returned."""
     _times(S, h, s)
     p = k0 - _dot(h, s)
     for i in range(s.shape[0]):
         e[i] = g[i] - s[i]
     _add_outer(S, 1.0 / (p + v), e, e)
     return p
+
+
+@njit(**BORROWING)
+def _factor_row(S, re, im, k, h, g, k0, v, s, e):
+    """Advance the explained covariance S over one row; e is written, the variance p returned."""
+    _move(S, re, im, k)
+    return _use_row(S, h, g, k0, v, s, e)
 
 
 @njit(**OPTIONS)
@@ -146,16 +158,10 @@ def _factor_segment(b, first, last, re, im, step, out, h, g, k0, v, S, s, before
     for i in range(first, last):
         m = i - first
         o = out[i]
-        k = step[i]
-        if k >= 0:
-            _rotate_rows(S, re[b, k], im[b, k])
-            _rotate_columns(S, re[b, k], im[b, k])
+        _move(S, re[b], im[b], step[i])
         _copy(S, before[m])
-        _times(S, h[b, o], s)
-        inverse[m] = 1.0 / (k0[b, o] - _dot(h[b, o], s) + v[b, i])
-        for j in range(s.shape[0]):
-            errors[m, j] = g[b, o, j] - s[j]
-        _add_outer(S, inverse[m], errors[m], errors[m])
+        p = _use_row(S, h[b, o], g[b, o], k0[b, o], v[b, i], s, errors[m])
+        inverse[m] = 1.0 / (p + v[b, i])
 
 
 @njit(**BORROWING)
@@ -401,9 +407,7 @@ def _information_row(info, re, back, k, h, e, inverse, u):
     _add_outer(info, -1.0, u, h)
     _add_outer(info, -1.0, h, u)
     _add_outer(info, c, h, h)
-    if k >= 0:
-        _rotate_rows(info, re[k], back[k])
-        _rotate_columns(info, re[k], back[k])
+    _move(info, re, back, k)
     return kappa
 
 

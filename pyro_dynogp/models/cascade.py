@@ -288,7 +288,7 @@ class Cascade:
             if isinstance(one.layer, Dynamic):
                 systems.append(self.sample_dynamic_layer(one, one.layer, time_scale))
             else:
-                systems.append(self.sample_static_layer(one, one.layer))
+                systems.append(self._sample_static(one, one.layer))
         flat = self.priors == "paper"
         offset = None
         if isinstance(self.layers[-1], Dynamic):
@@ -317,8 +317,14 @@ class Cascade:
         )
         return DynamicSystem(modes, past_input_covariance(modes, 1.0 / time_scale.typical_rate))
 
-    def sample_static_layer(self, one: Wire, layer: Static) -> StaticSystem:
-        """Sample the parameters of one static layer."""
+    def static_given(
+        self, one: Wire, layer: Static, values: Mapping[str, Tensor]
+    ) -> StaticFunction:
+        """The function of a static layer given values of its sites; no trace sees it."""
+        with pyro.poutine.block(), pyro.poutine.condition(data=dict(values)):
+            return self._sample_static(one, layer).function
+
+    def _sample_static(self, one: Wire, layer: Static) -> StaticSystem:
         function = sample_static(
             one.name,
             channels=one.channels,

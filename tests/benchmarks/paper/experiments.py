@@ -42,6 +42,7 @@ class Experiment:
         system: of a simulated study, where a seed is a record of its own: what made it.
         targets: what the project set out to reach, by score (of the first test record).
         paper: score -> figures of dynoGP, dynoNet, GP-NARX as published.
+        needs: environment variable without which there are no records; None for none.
         unit: of the output. note: what to know about the protocol.
     """
 
@@ -58,6 +59,7 @@ class Experiment:
     system: Callable[[int], System] | None = None
     targets: Mapping[str, float] = field(default_factory=dict)
     paper: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    needs: str | None = None
     unit: str = ""
     note: str = ""
 
@@ -181,7 +183,7 @@ EXPERIMENTS = {
     "circuit_ten": Experiment(
         "Wiener-Hammerstein with process noise, ten realisations", _whole_circuit,
         (5, "static", 5), (True, False), seconds=3600.0, seeds=(0,), follows=False,
-        test_process_noise=False, unit="V",
+        test_process_noise=False, needs=CIRCUIT_VARIABLE, unit="V",
         targets={"rmse": 0.020, "crps": 0.012, "rmse swept sine": 0.021},
         note=f"Learned from ten records of 8192 samples at once; {CIRCUIT_VARIABLE} names their "
         "folder.",

@@ -12,7 +12,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from tests.benchmarks.paper.experiments import CIRCUIT_VARIABLE, EXPERIMENTS
+from tests.benchmarks.paper.experiments import EXPERIMENTS
 from tests.benchmarks.paper.job import METHODS
 from tests.benchmarks.paper.ours import STACK
 from tests.benchmarks.paper.page import page
@@ -32,7 +32,7 @@ def jobs(
         for method in (methods or METHODS)
         for seed in EXPERIMENTS[experiment].seeds
         if (experiment, method) not in LEFT_OUT
-        and (experiment != "circuit_ten" or CIRCUIT_VARIABLE in os.environ)
+        and EXPERIMENTS[experiment].needs in (None, *os.environ)
     ]
 
 
