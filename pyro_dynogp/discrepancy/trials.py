@@ -37,6 +37,8 @@ CASCADE_STEPS, CASCADE_STARTS = 300, 4
 # Blocks of a record on which effects of one instant are scored, every other one at a time.
 BLOCKS = 12
 Score = Literal["one step", "forecast"]
+# Starts that climb side by side: processors are kept busy by other trials.
+TOGETHER = 8
 # How often the best variant is refined.
 REFINEMENTS = 2
 
@@ -200,7 +202,7 @@ def _linear(
             starts.append(values_given_poles(model, records, model.scaling, kept)[1])
     if base is not None and not isinstance(base.model, Cascade):
         starts.append(grown(base.mode, starts[-1]))
-    return maximise(model, records[0], starts, steps=steps, seed=seed, workers=1)
+    return maximise(model, records[0], starts, steps=steps, seed=seed, workers=1, together=TOGETHER)
 
 
 def _cascade(
@@ -224,8 +226,9 @@ def _cascade(
         learnt = [grown(base.mode, starts[0])]
         starts, steps = ([], steps // 5) if short else (starts, steps // 2)
     return climb(
-        target, records[0], starts, learnt, optimizer="adam", steps=steps, seed=seed, workers=1
-    )
+        target, records[0], starts, learnt, optimizer="adam", steps=steps, seed=seed, workers=1,
+        together=TOGETHER,
+    )  # fmt: skip
 
 
 def poles_of(fit: Fit) -> np.ndarray | None:

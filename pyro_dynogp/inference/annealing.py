@@ -17,15 +17,13 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-import pyro
 import torch
 from pyro.distributions import MultivariateStudentT
 from torch import Tensor
 from tqdm import tqdm
 
 from pyro_dynogp.inference.guides import GaussianGuide
-from pyro_dynogp.inference.potential import Site, log_prob_by_draw, parts
-from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
+from pyro_dynogp.inference.potential import Site, each_with_gradient, joint_energy
 
 # Effective share of particles after a step; Hamiltonian moves at each temperature, and at the end.
 EFFECTIVE, MOVES, LAST_MOVES = 0.5, 2, 4
@@ -61,36 +59,11 @@ class Joint:
     def __call__(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Value (S,) and gradient (S, d)."""
         far = ~(z.abs() <= REACH).all(-1)
-        value, gradient = self._each(z.masked_fill(far[:, None], 0.0))
-        return value.masked_fill(far, -torch.inf), gradient.masked_fill(far[:, None], 0.0)
+        energy, slope = each_with_gradient(self._energy, z.masked_fill(far[:, None], 0.0))
+        return -energy.masked_fill(far, torch.inf), -slope.masked_fill(far[:, None], 0.0)
 
-    def _each(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Where one particle breaks the evaluation of all, it is found by halving."""
-        x = z.detach().requires_grad_()
-        try:
-            with torch.enable_grad(), pyro.validation_enabled(False):
-                value = self._value(x)
-                (gradient,) = torch.autograd.grad(value.sum(), x)
-        except (NotPositiveDefiniteError, torch.linalg.LinAlgError, ValueError):
-            if len(z) == 1:  # as in `Potential`: numbers out of range, a singular covariance
-                return torch.full((1,), -torch.inf, dtype=torch.float64), torch.zeros_like(z)
-            halves = [self._each(half) for half in z.tensor_split(2)]
-            return torch.cat([v for v, _ in halves]), torch.cat([g for _, g in halves])
-        bad = ~(torch.isfinite(value) & torch.isfinite(gradient).all(-1))
-        return value.detach().masked_fill(bad, -torch.inf), gradient.masked_fill(bad[:, None], 0.0)
-
-    def _value(self, z: Tensor) -> Tensor:
-        values: dict[str, Tensor] = {}
-        total = torch.zeros(len(z), dtype=torch.float64)
-        for site, part in parts(self.sites, z):
-            value = site.transform(part)
-            values[site.name] = value
-            jacobian = site.transform.log_abs_det_jacobian(part, value)
-            total = total + jacobian.reshape(len(z), -1).sum(1)
-        conditioned = pyro.poutine.condition(self.model, data=values)
-        trace = pyro.poutine.trace(conditioned).get_trace(*self.args)
-        trace.compute_log_prob()
-        return total + log_prob_by_draw(trace, len(z))
+    def _energy(self, z: Tensor) -> Tensor:
+        return joint_energy(self.model, self.args, self.sites, z, jacobian=True)
 
 
 @dataclass(frozen=True, eq=False)

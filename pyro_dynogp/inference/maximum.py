@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -18,13 +19,17 @@ from pyro_dynogp.inference.checkpoints import (
     tensor_text,
     text_tensor,
 )
+from pyro_dynogp.inference.lockstep import Function, in_lockstep
 from pyro_dynogp.inference.potential import Potential
 from pyro_dynogp.parallel import parallel_map, seeded
-from pyro_dynogp.record import Record
+from pyro_dynogp.record import Record, as_records
 
 Optimizer = Literal["lbfgs", "adam"]
 # Adam's first step, and how often it goes back to the best point with a shorter one.
 RATE, RETURNS = 0.02, 2
+# Starts that climb together, as long as they have no more samples than this in all: longer records
+# keep a processor busy one by one.
+TOGETHER, BATCH_SAMPLES = 4, 8000
 
 
 @dataclass(frozen=True)
@@ -46,9 +51,11 @@ class Optimum:
 
 @dataclass(frozen=True)
 class _Task:
+    """Starts that climb together."""
+
     model: Any
     records: Record | Sequence[Record]
-    values: dict[str, Tensor]
+    starts: tuple[dict[str, Tensor], ...]
     optimizer: Optimizer
     steps: int
     seed: int
@@ -58,12 +65,12 @@ class _Task:
 
 
 def _lbfgs(
-    potential: Potential, z: np.ndarray, steps: int, rate: float
+    function: Function, z: np.ndarray, steps: int, rate: float
 ) -> tuple[np.ndarray, list, str]:
     del rate  # its line search finds the step
     history: list[float] = []
     result = minimize(
-        potential.value_and_gradient,
+        function,
         z,
         jac=True,
         method="L-BFGS-B",
@@ -74,7 +81,7 @@ def _lbfgs(
 
 
 def _adam(
-    potential: Potential, z: np.ndarray, steps: int, rate: float
+    function: Function, z: np.ndarray, steps: int, rate: float
 ) -> tuple[np.ndarray, list, str]:
     """Adam with a falling step; back to the best point with a shorter one where it got lost.
 
@@ -87,7 +94,7 @@ def _adam(
     since, returns = 0, 0
     for done in range(steps):
         here = x.detach().numpy().copy()
-        value, gradient = potential.value_and_gradient(here)
+        value, gradient = function(here)
         history.append(value)
         since += 1
         if value < best - 1e-3:
@@ -117,35 +124,65 @@ def _from(z: np.ndarray, rate: float, steps: int) -> tuple[Tensor, Any, Any]:
 _METHODS = {"lbfgs": _lbfgs, "adam": _adam}
 
 
-def _optimise(task: _Task) -> Optimum:
-    piece = task.checkpoints.piece(task.key, lambda: _pack(_climb(task)))
-    return _unpack(piece)
+def _optimise(task: _Task) -> list[Optimum]:
+    return _unpack(task.checkpoints.piece(task.key, lambda: _pack(_climb(task))))
 
 
-def _climb(task: _Task) -> Optimum:
+def _climb(task: _Task) -> list[Optimum]:
     with seeded(task.seed):
-        potential = Potential(task.model, (task.records,), task.values)
-        z = potential.pack(task.values).numpy()
-        z, history, message = _METHODS[task.optimizer](potential, z, task.steps, task.rate)
-        energy = potential.value_and_gradient(z)[0]
-        values = {k: v.detach() for k, v in potential.unpack(torch.tensor(z)).items()}
-    return Optimum(energy, values, np.asarray(history), message)
+        potential = Potential(task.model, (task.records,), task.starts[0])
+        method = _METHODS[task.optimizer]
+
+        def run(start: dict[str, Tensor]) -> Callable[[Function], tuple[np.ndarray, list, str]]:
+            z = potential.pack(start).numpy()
+            return lambda function: method(function, z, task.steps, task.rate)
+
+        found = in_lockstep(potential.values_and_gradients, [run(start) for start in task.starts])
+        ends = np.stack([z for z, _, _ in found])
+        energies = potential.values_and_gradients(ends)[0]
+        return [
+            Optimum(float(energy), _values(potential, z), np.asarray(history), message)
+            for energy, (z, history, message) in zip(energies, found, strict=True)
+        ]
 
 
-def _pack(optimum: Optimum) -> Piece:
-    return {
-        "energy": torch.tensor(optimum.energy, dtype=torch.float64),
-        "history": torch.tensor(optimum.history, dtype=torch.float64),
-        "message": text_tensor(optimum.message),
-        **{f"value/{name}": value for name, value in optimum.values.items()},
-    }
+def _values(potential: Potential, z: np.ndarray) -> dict[str, Tensor]:
+    return {k: v.detach() for k, v in potential.unpack(torch.tensor(z)).items()}
 
 
-def _unpack(piece: Piece) -> Optimum:
-    values = {k[len("value/") :]: v for k, v in piece.items() if k.startswith("value/")}
-    message = tensor_text(piece["message"])
-    history = piece["history"].numpy()
-    return Optimum(float(piece["energy"]), values, history, message)
+def _pack(optima: Sequence[Optimum]) -> Piece:
+    piece: Piece = {}
+    for i, one in enumerate(optima):
+        piece[f"{i}/energy"] = torch.tensor(one.energy, dtype=torch.float64)
+        piece[f"{i}/history"] = torch.tensor(one.history, dtype=torch.float64)
+        piece[f"{i}/message"] = text_tensor(one.message)
+        piece |= {f"{i}/value/{name}": value for name, value in one.values.items()}
+    return piece
+
+
+def _unpack(piece: Piece) -> list[Optimum]:
+    optima: list[Optimum] = []
+    while f"{len(optima)}/energy" in piece:
+        own = f"{len(optima)}/"
+        mark = f"{own}value/"
+        values = {k.removeprefix(mark): v for k, v in piece.items() if k.startswith(mark)}
+        energy, history = float(piece[f"{own}energy"]), piece[f"{own}history"].numpy()
+        optima.append(Optimum(energy, values, history, tensor_text(piece[f"{own}message"])))
+    return optima
+
+
+def _batches(
+    starts: Sequence[dict[str, Tensor]],
+    model: Any,
+    records: Record | Sequence[Record],
+    together: int,
+) -> list[tuple[dict[str, Tensor], ...]]:
+    """Starts in batches of nearly one size."""
+    outputs = sum(len(one) * max(one.n_outputs, 1) for one in as_records(records))
+    pays = BATCH_SAMPLES // outputs if getattr(model, "takes_batches", False) else 1
+    count = -(-len(starts) // max(1, min(together, pays)))
+    edges = np.linspace(0, len(starts), count + 1).round().astype(int)
+    return [tuple(starts[a:b]) for a, b in itertools.pairwise(edges)]
 
 
 def maximise(
@@ -162,13 +199,15 @@ def maximise(
     key: str = "optimum",
     kept: float = 1 / 3,
     rate: float = RATE,
+    together: int = TOGETHER,
 ) -> list[Optimum]:
     """Climb from every start; the optima sorted by energy, best first.
 
     All starts get a fifth of the steps, then the best of them, the share `kept`, the rest
     (successive halving: a start that is far behind by then hardly ever wins). The mode is that of
     the density of the constrained values (no Jacobian), as AutoDelta has it. `rate` is Adam's
-    first step, in unconstrained units.
+    first step, in unconstrained units. Up to `together` starts climb side by side where evaluating
+    them at once pays; how many does not depend on the number of processors, nor does the result.
     """
 
     def climb(values: Sequence[dict[str, Tensor]], count: int, label: str) -> list[Optimum]:
@@ -176,7 +215,7 @@ def maximise(
             _Task(
                 model,
                 records,
-                value,
+                batch,
                 optimizer,
                 count,
                 seed,
@@ -184,16 +223,17 @@ def maximise(
                 f"{key}-{label}-{i}",
                 rate,
             )
-            for i, value in enumerate(values)
+            for i, batch in enumerate(_batches(values, model, records, together))
         ]
-        return parallel_map(
+        found = parallel_map(
             _optimise,
             tasks,
             workers=workers,
             progress=progress,
-            description=label,
-            news=lambda found: f"log p {-min(o.energy for o in found):.2f}",
+            description=f"{label}, {len(values)}",
+            news=lambda done: f"log p {-min(o.energy for batch in done for o in batch):.2f}",
         )
+        return [optimum for batch in found for optimum in batch]
 
     def best_first(optima: list[Optimum]) -> list[Optimum]:
         return sorted(optima, key=lambda optimum: optimum.energy)

@@ -54,6 +54,58 @@ def log_prob_by_draw(trace: Any, count: int) -> Tensor:
     return total
 
 
+def joint_energy(
+    model: Callable[..., Any],
+    args: tuple[Any, ...],
+    sites: Sequence[Site],
+    z: Tensor,
+    *,
+    jacobian: bool,
+) -> Tensor:
+    """-log p(y, values) at the unconstrained vector z (d,), or (k,) at vectors z (k, d) together.
+
+    With `jacobian` the density is that of the unconstrained vector.
+    """
+    values: dict[str, Tensor] = {}
+    log_jacobian = torch.zeros(z.shape[:-1], dtype=torch.float64)
+    for site, part in parts(sites, z):
+        value = site.transform(part)
+        values[site.name] = value
+        if jacobian:
+            each = site.transform.log_abs_det_jacobian(part, value)
+            log_jacobian = log_jacobian + each.reshape(*z.shape[:-1], -1).sum(-1)
+    trace = _scored(model, args, values)
+    log_joint = trace.log_prob_sum() if z.dim() == 1 else log_prob_by_draw(trace, len(z))
+    return -log_joint - log_jacobian
+
+
+def _scored(model: Callable[..., Any], args: tuple[Any, ...], values: Mapping[str, Tensor]) -> Any:
+    """Trace of a model at given values, with the log-density of every site."""
+    conditioned = pyro.poutine.condition(model, data=dict(values))
+    trace = pyro.poutine.trace(conditioned).get_trace(*args)
+    trace.compute_log_prob()
+    return trace
+
+
+def each_with_gradient(energy: Callable[[Tensor], Tensor], z: Tensor) -> tuple[Tensor, Tensor]:
+    """Energies (k,) at z (k, d) and their gradients (k, d), infinite and zero where there are none.
+
+    Where one point breaks the evaluation of all, it is found by halving.
+    """
+    x = z.detach().requires_grad_()
+    try:
+        with torch.enable_grad(), pyro.validation_enabled(False), denormals_flushed():
+            value = energy(x)
+            (gradient,) = torch.autograd.grad(value.sum(), x)
+    except (NotPositiveDefiniteError, torch.linalg.LinAlgError, ValueError):
+        if len(z) == 1:
+            return torch.full((1,), torch.inf, dtype=torch.float64), torch.zeros_like(z)
+        halves = [each_with_gradient(energy, half) for half in z.tensor_split(2)]
+        return torch.cat([v for v, _ in halves]), torch.cat([g for _, g in halves])
+    bad = ~(torch.isfinite(value) & torch.isfinite(gradient).all(-1))
+    return value.detach().masked_fill(bad, torch.inf), gradient.masked_fill(bad[:, None], 0.0)
+
+
 @contextlib.contextmanager
 def denormals_flushed() -> Iterator[None]:
     """Inside, numbers below 1e-308 are zero; outside nothing has changed.
@@ -72,6 +124,9 @@ def denormals_flushed() -> Iterator[None]:
 class Potential:
     """Sites of a model given its arguments, and its log joint density.
 
+    A model whose class says ``takes_batches = True`` runs with values (k, *shape) of every site as
+    it does with one of each; several points then go through it together.
+
     `nearly_normal` says whether the density is so close to normal that Laplace's approximation at
     the mode is all the preparation that chains need.
 
@@ -89,6 +144,7 @@ class Potential:
         self, model: Callable[..., Any], args: tuple[Any, ...], values: Mapping[str, Tensor]
     ) -> None:
         self.model, self.args, self.at = model, args, dict(values)
+        self.takes_batches = bool(getattr(model, "takes_batches", False))
         trace = pyro.poutine.trace(pyro.poutine.condition(model, data=dict(values))).get_trace(
             *args
         )
@@ -107,6 +163,13 @@ class Potential:
                 value = node["value"].detach()
                 transform = biject_to(node["fn"].support)
                 self.sites.append(Site(name, value.shape, transform.inv(value).shape, transform))
+        observed = [node["value"] for node in trace.nodes.values()
+                    if node["type"] == "sample" and node["is_observed"]]  # fmt: skip
+        # Points that are evaluated at once.
+        self.width = 1
+        if self.takes_batches:
+            count = sum(y.numel() for y in observed if torch.is_tensor(y))
+            self.width = max(1, AT_ONCE // max(count, 1))
 
     @property
     def size(self) -> int:
@@ -127,19 +190,14 @@ class Potential:
 
     def log_joint(self, values: Mapping[str, Tensor]) -> Tensor:
         """Log p(y, values), of constrained values."""
-        conditioned = pyro.poutine.condition(self.model, data=dict(values))
-        return pyro.poutine.trace(conditioned).get_trace(*self.args).log_prob_sum()
+        return _scored(self.model, self.args, values).log_prob_sum()
 
     def energy(self, z: Tensor, *, jacobian: bool) -> Tensor:
-        """-log density at z (d,): of the values, or with `jacobian` of the unconstrained vector."""
-        values: dict[str, Tensor] = {}
-        log_jacobian: Tensor | float = 0.0
-        for site, part in parts(self.sites, z):
-            value = site.transform(part)
-            values[site.name] = value
-            if jacobian:
-                log_jacobian = log_jacobian + site.transform.log_abs_det_jacobian(part, value).sum()
-        return -self.log_joint(values) - log_jacobian
+        """-log density at z (d,) or, of a model that takes batches, (k,) at z (k, d).
+
+        Of the values, or with `jacobian` of the unconstrained vector.
+        """
+        return joint_energy(self.model, self.args, self.sites, z, jacobian=jacobian)
 
     def value_and_gradient(
         self, z: np.ndarray, *, jacobian: bool = False
@@ -149,17 +207,27 @@ class Potential:
         Where the density cannot be evaluated (a covariance singular to rounding, a number out of
         range) the energy is so high that a line search steps back.
         """
-        x = torch.tensor(z, dtype=torch.float64, requires_grad=True)
-        try:
-            with pyro.validation_enabled(False), denormals_flushed():
-                energy = self.energy(x, jacobian=jacobian)
-                (gradient,) = torch.autograd.grad(energy, x)
-        except (NotPositiveDefiniteError, torch.linalg.LinAlgError, ValueError):
-            return _WALL, np.zeros_like(z)
-        value, slope = float(energy.detach()), gradient.numpy()
-        if not (np.isfinite(value) and np.isfinite(slope).all()):
-            return _WALL, np.zeros_like(z)
-        return value, slope
+        values, gradients = self.values_and_gradients(z[None], jacobian=jacobian)
+        return float(values[0]), gradients[0]
+
+    def values_and_gradients(
+        self, z: np.ndarray, *, jacobian: bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Energies (k,) and their gradients (k, d) at z (k, d), as `value_and_gradient` has them.
+
+        A model that takes batches is evaluated at `width` points at once.
+        """
+
+        def energy(x: Tensor) -> Tensor:
+            if len(x) == 1:
+                return self.energy(x[0], jacobian=jacobian)[None]
+            return self.energy(x, jacobian=jacobian)
+
+        parts_of = torch.tensor(z, dtype=torch.float64).split(self.width)
+        found = [each_with_gradient(energy, part) for part in parts_of]
+        values = torch.cat([value for value, _ in found]).numpy()
+        values[np.isinf(values)] = _WALL
+        return values, torch.cat([gradient for _, gradient in found]).numpy()
 
     def hessian(self, z: np.ndarray, *, step: float = 1e-4) -> np.ndarray:
         """Hessian (d, d) of the energy with Jacobian, by central differences of the gradient."""
@@ -167,13 +235,11 @@ class Potential:
 
     def hessian_of(self, z: np.ndarray, some: Sequence[int], *, step: float = 1e-4) -> np.ndarray:
         """Rows and columns of `hessian` that belong to some entries of z."""
-        H = np.empty((len(some), len(some)))
-        for row, i in enumerate(some):
-            shift = np.zeros(z.shape[0])
-            shift[i] = step
-            up = self.value_and_gradient(z + shift, jacobian=True)[1]
-            down = self.value_and_gradient(z - shift, jacobian=True)[1]
-            H[row] = (up - down)[list(some)] / (2.0 * step)
+        shifts = np.zeros((len(some), z.shape[0]))
+        shifts[np.arange(len(some)), list(some)] = step
+        both = np.concatenate([z + shifts, z - shifts])
+        up, down = np.split(self.values_and_gradients(both, jacobian=True)[1], 2)
+        H = ((up - down) / (2.0 * step))[:, list(some)]
         return 0.5 * (H + H.T)
 
     def log_evidence(self, values: Mapping[str, Tensor], *, widest: float) -> float:
@@ -207,6 +273,9 @@ class Potential:
 
 
 _WALL = 1e15
+# Samples in all, over the points of a batch, up to which more points cost less than one by one:
+# above, the compiled recursions are what an evaluation costs.
+AT_ONCE = 12_000
 # Unconstrained value of what lies on a boundary: within 1e-13 of it.
 EDGE = 30.0
 

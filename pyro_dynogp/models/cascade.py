@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
+from typing import ClassVar, Literal
 
 import pyro
 import pyro.distributions as dist
@@ -186,6 +186,9 @@ class Cascade:
     Raises:
         ValueError: on layers that do not fit together, or unknown options.
     """
+
+    # Sites may have a batch dimension on the left: many points go through the model at once.
+    takes_batches: ClassVar[bool] = True
 
     inputs: int
     layers: tuple[Layer, ...]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import pyro
 import pyro.distributions as dist
@@ -78,6 +78,9 @@ class LinearDynamicGP:
     Raises:
         ValueError: on numbers below the least that makes sense, or unknown options.
     """
+
+    # Sites may have a batch dimension on the left: many points go through the model at once.
+    takes_batches: ClassVar[bool] = True
 
     inputs: int
     outputs: int = 1
