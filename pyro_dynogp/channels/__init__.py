@@ -6,7 +6,7 @@ adds columns; those that are `direct` act on the output at once (see `direct` of
 are on the clock of the training record, which parts of one record share.
 """
 
-from pyro_dynogp.channels.base import Channel
+from pyro_dynogp.channels.base import Channel, Quantity
 from pyro_dynogp.channels.clock import Calendar, ShiftedClock, Sinusoid, Step, Trend, TrendOfGain
 from pyro_dynogp.channels.prepare import count_direct, from_plain, prepared, to_plain
 from pyro_dynogp.channels.signal import (
@@ -25,6 +25,7 @@ __all__ = [
     "Delayed",
     "Play",
     "Product",
+    "Quantity",
     "Recorded",
     "ShiftedClock",
     "Sinusoid",

@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from pyro_dynogp._errors import invalid
 from pyro_dynogp.record import Record
 from pyro_dynogp.signals import held
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What a number of a channel is.
+
+    Attributes:
+        name: in words. unit: "time", that of the clock, or "channel", that of the channel.
+        low: its lower bound.
+    """
+
+    name: str
+    unit: Literal["time", "channel"]
+    low: float = -np.inf
 
 
 @dataclass(frozen=True)
@@ -21,10 +36,12 @@ class Channel:
     Attributes:
         direct: whether the columns act on the output at once, past dynamics and nonlinearities.
         replacing: whether they stand for the input that is the field `channel`.
+        numbers: fields that data are to say, with what they are.
     """
 
     direct: ClassVar[bool] = False
     replacing: ClassVar[bool] = False
+    numbers: ClassVar[Mapping[str, Quantity]] = {}
 
     @property
     def replaces(self) -> str:

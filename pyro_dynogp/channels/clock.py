@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
@@ -9,7 +10,7 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 import numpy as np
 
 from pyro_dynogp._errors import invalid
-from pyro_dynogp.channels.base import Channel, signal_of
+from pyro_dynogp.channels.base import Channel, Quantity, signal_of
 from pyro_dynogp.channels.signal import Replacement
 from pyro_dynogp.record import Record
 from pyro_dynogp.signals import delayed
@@ -25,6 +26,7 @@ class Step(Channel):
     """Zero before an instant, one from it on [time unit]: a shift of the output's level."""
 
     direct: ClassVar[bool] = True
+    numbers: ClassVar[Mapping[str, Quantity]] = {"at": Quantity("instant", "time")}
     at: float
 
     def _names(self) -> tuple[str, ...]:
@@ -76,6 +78,7 @@ class Sinusoid(Channel):
     """Cosine and sine of a known period [time unit] and of its harmonics."""
 
     direct: ClassVar[bool] = True
+    numbers: ClassVar[Mapping[str, Quantity]] = {"period": Quantity("period", "time")}
     period: float
     harmonics: int = 1
 
@@ -143,6 +146,7 @@ class ShiftedClock(Replacement):
     """
 
     label: ClassVar[str] = "on a corrected clock"
+    numbers: ClassVar[Mapping[str, Quantity]] = {"shift": Quantity("clock shift", "time")}
     shift: float
     times: tuple[float, ...]
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from pyro_dynogp._errors import invalid
-from pyro_dynogp.channels.base import Channel, signal_of, unit_of
+from pyro_dynogp.channels.base import Channel, Quantity, signal_of, unit_of
 from pyro_dynogp.record import Record
 from pyro_dynogp.signals import dead_zone, delayed, play
 
@@ -55,6 +56,7 @@ class Delayed(Replacement):
     """
 
     label: ClassVar[str] = "delayed"
+    numbers: ClassVar[Mapping[str, Quantity]] = {"delay": Quantity("dead time", "time", 0.0)}
     delay: float
 
     def _columns(self, record: Record) -> np.ndarray:
@@ -69,6 +71,10 @@ class DeadZone(Replacement):
     """
 
     label: ClassVar[str] = "beyond dead zone"
+    numbers: ClassVar[Mapping[str, Quantity]] = {
+        "low": Quantity("lower limit", "channel"),
+        "high": Quantity("upper limit", "channel"),
+    }
     low: float
     high: float
 
@@ -81,6 +87,7 @@ class Play(Replacement):
     """An input behind mechanical play (backlash) of the given full width [input]."""
 
     label: ClassVar[str] = "behind play"
+    numbers: ClassVar[Mapping[str, Quantity]] = {"width": Quantity("play", "channel", 0.0)}
     width: float
 
     def _columns(self, record: Record) -> np.ndarray:

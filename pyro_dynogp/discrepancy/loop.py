@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pyro_dynogp._errors import invalid
-from pyro_dynogp.channels import count_direct
 from pyro_dynogp.criticism.comparison import block_standard_error
-from pyro_dynogp.criticism.posterior_draws import draws_of
 from pyro_dynogp.discrepancy import words
 from pyro_dynogp.discrepancy.blocks import Blocks, blocks_of, shared
 from pyro_dynogp.discrepancy.confirm import Confirmed, confirm
@@ -21,6 +19,7 @@ from pyro_dynogp.discrepancy.evidence import Residuals
 from pyro_dynogp.discrepancy.extend import Model, has_function, used_channels
 from pyro_dynogp.discrepancy.gate import structure_left
 from pyro_dynogp.discrepancy.noise_effects import data_faults
+from pyro_dynogp.discrepancy.parameters import parameters_of
 from pyro_dynogp.discrepancy.report import Attempt, FoundEffect, Report
 from pyro_dynogp.discrepancy.residuals import residuals_of
 from pyro_dynogp.discrepancy.search import Found, candidates_of, look, merged
@@ -324,7 +323,7 @@ def _report(
     tests = _tested([f for f, _ in accepted], (base, extended), whole, sealed, state)
     return Report(
         effects=(
-            *(_effect(f, c, extended) for f, c in accepted),
+            *(_effect(f, c, extended, data.known) for f, c in accepted),
             *(_only_reported(f) for f in reported),
         ),
         outcome=_outcome(bool(accepted), left),
@@ -375,12 +374,11 @@ def _tested(
     return {effect.name: (p[2 * k], p[2 * k + 1]) for k, effect in enumerate(effects)}
 
 
-def _effect(found: Found, confirmed: Confirmed, extended: Fit) -> FoundEffect:
+def _effect(found: Found, confirmed: Confirmed, extended: Fit, record: Record) -> FoundEffect:
     attempt = confirmed.attempt
     assert attempt is not None
     assert confirmed.model is not None
-    before = len(confirmed.before.channels)
-    own = confirmed.model.channels[before:]
+    own = [one for one in confirmed.model.channels if one not in confirmed.before.channels]
     lines = [words.in_words(one) for one in own] or words.describe(confirmed.model)
     return FoundEffect(
         name=found.effect.name,
@@ -390,7 +388,7 @@ def _effect(found: Found, confirmed: Confirmed, extended: Fit) -> FoundEffect:
         gain=attempt.gain,
         gain_error=attempt.gain_error,
         size=found.evidence.size,
-        parameters=_weights(extended, own),
+        parameters=parameters_of(extended, own, record),
         block="; ".join(lines),
         curve=found.evidence.curve,
         ties=confirmed.ties,
@@ -411,27 +409,6 @@ def _only_reported(found: Found) -> FoundEffect:
         block="",
         curve=found.evidence.curve,
     )
-
-
-def _weights(fit: Fit, channels: Sequence[Any]) -> dict[str, tuple[float, float]]:
-    """Posterior mean and sd of what a direct channel adds to the output, by column [output]."""
-    out: dict[str, tuple[float, float]] = {}
-    if "direct" not in fit.mode:
-        return out
-    drawn = draws_of(fit, count=200, seed=0, anneal=False).values if fit.method == "map" else (
-        fit.draws
-    )  # fmt: skip
-    first = fit.model.inputs - fit.model.direct
-    offset = fit.model.direct - count_direct(fit.model.channels)
-    names = fit.scaling.input_names[first:]
-    weights = drawn["direct"][:, 0].numpy() * fit.scaling.output_scale[0]
-    weights = weights / fit.scaling.input_scale[first:]
-    for channel in channels:
-        for name in channel.names:
-            if channel.direct and name in names[offset:]:
-                column = weights[:, names.index(name)]
-                out[name] = float(column.mean()), float(column.std())
-    return out
 
 
 def _mean(value: Any) -> float:

@@ -149,8 +149,10 @@ class Report:
 
     def __str__(self) -> str:
         lines = [f"{self.outcome[:1].upper()}{self.outcome[1:]}."]
-        lines += [f"{k}. {one.name}: {one.sentence}" for k, one in enumerate(self.effects, 1)]
-        for one in self.effects:
+        for k, one in enumerate(self.effects, 1):
+            lines.append(f"{k}. {one.name}: {one.sentence}")
+            lines += [f"   {name}: {mean:.4g} +- {sd:.2g}" for name, (mean, sd) in
+                      one.parameters.items()]  # fmt: skip
             if one.ties:
                 lines.append(f"   {one.name} or {', '.join(one.ties)}: {one.experiment}")
         lines.append(self.data)

@@ -19,6 +19,7 @@ from pyro_dynogp.inference.guides import Guide
 from pyro_dynogp.inference.layered import fit_layered
 from pyro_dynogp.inference.maximum import Optimizer, Optimum, maximise
 from pyro_dynogp.inference.posterior import Hyperparameters, posterior_of
+from pyro_dynogp.inference.potential import WALL
 from pyro_dynogp.inference.result import Fit, Method
 from pyro_dynogp.inference.sampling import sample_posterior
 from pyro_dynogp.inference.starts import grown, starting_values
@@ -185,7 +186,7 @@ def fit(
             progress=progress,
             checkpoints=kept,
         )
-    if optima[0].energy >= 1e15:
+    if optima[0].energy >= WALL:
         raise ValueError(
             "fit: no start reached a point where the likelihood can be evaluated. Check the "
             "record for jumps of many orders of magnitude, or try fewer pairs."

@@ -226,7 +226,7 @@ class Potential:
         parts_of = torch.tensor(z, dtype=torch.float64).split(self.width)
         found = [each_with_gradient(energy, part) for part in parts_of]
         values = torch.cat([value for value, _ in found]).numpy()
-        values[np.isinf(values)] = _WALL
+        values[np.isinf(values)] = WALL
         return values, torch.cat([gradient for _, gradient in found]).numpy()
 
     def hessian(self, z: np.ndarray, *, step: float = 1e-4) -> np.ndarray:
@@ -272,7 +272,8 @@ class Potential:
         return result.x, laplace_root(self.hessian(result.x), widest=widest)
 
 
-_WALL = 1e15
+# Energy where there is no density.
+WALL = 1e15
 # Samples in all, over the points of a batch, up to which more points cost less than one by one:
 # above, the compiled recursions are what an evaluation costs.
 AT_ONCE = 12_000

@@ -1,0 +1,150 @@
+"""What a block has learnt: the posterior of its gains, delays, limits and instants."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from torch import Tensor
+
+from pyro_dynogp.channels import Channel, Delayed, Quantity, count_direct, prepared
+from pyro_dynogp.channels.base import unit_of
+from pyro_dynogp.criticism.posterior_draws import draws_of
+from pyro_dynogp.inference.number import Number, number_posterior
+from pyro_dynogp.inference.potential import Potential
+from pyro_dynogp.lti.views import steady_state_gain
+from pyro_dynogp.models.linear import LinearDynamicGP
+from pyro_dynogp.record import Record
+
+if TYPE_CHECKING:
+    from pyro_dynogp.inference.result import Fit
+
+Parameters = dict[str, tuple[float, float]]
+DRAWS = 200
+
+
+def parameters_of(fit: Fit, channels: Sequence[Channel], record: Record) -> Parameters:
+    """Posterior mean and standard deviation by name, unit included, of some channels of a model.
+
+    The steady-state gain of a channel that acts through linear dynamics, what a direct one adds to
+    the output for one unit of it, and the numbers that a channel is made with.
+
+    Args:
+        fit: to the record. channels: of its model. record: as measured, without the channels.
+    """
+    out: Parameters = {}
+    present = [one for one in channels if one in fit.model.channels]
+    acting = [one for one in present if one.direct or not one.replaces]
+    if acting and fit.model.outputs == 1:
+        drawn = fit.draws
+        if fit.method == "map":
+            drawn = draws_of(fit, count=DRAWS, seed=0, anneal=False).values
+        out |= _weights(fit, acting, drawn) | _gains(fit, acting, drawn)
+    for group in _together(present):
+        out |= _numbers(fit, group, record)
+    return out
+
+
+def _weights(fit: Fit, channels: Sequence[Channel], drawn: Mapping[str, Tensor]) -> Parameters:
+    """Of direct channels, by column [output, for one unit of the column]."""
+    if "direct" not in drawn:
+        return {}
+    first = fit.model.inputs - fit.model.direct
+    offset = fit.model.direct - count_direct(fit.model.channels)
+    names = fit.scaling.input_names[first:]
+    weights = drawn["direct"][:, 0].numpy() * fit.scaling.output_scale[0]
+    weights = weights / fit.scaling.input_scale[first:]
+    own = {name for one in channels if one.direct for name in one.names}
+    return {
+        _label(name, fit.scaling.output_units[0]): _moments(weights[:, k])
+        for k, name in enumerate(names)
+        if k >= offset and name in own
+    }
+
+
+def _gains(fit: Fit, channels: Sequence[Channel], drawn: Mapping[str, Tensor]) -> Parameters:
+    """Of channels that act through the dynamics of a linear model, for constant inputs."""
+    own = {name for one in channels if not one.direct for name in one.names}
+    if not own or not isinstance(fit.model, LinearDynamicGP):
+        return {}
+    gains = steady_state_gain(fit._system_at(drawn).modes)[..., 0, :].numpy()
+    scaling = fit.scaling
+    return {
+        _label(f"steady-state gain of {name}", _ratio(scaling.output_units[0], unit)): _moments(
+            gains[:, k]
+        )
+        for k, (name, unit) in enumerate(zip(scaling.input_names, scaling.input_units, strict=True))
+        if name in own
+    }
+
+
+def _together(channels: Sequence[Channel]) -> list[list[Channel]]:
+    """Channels with numbers; those that share one dead time in one group."""
+    groups: list[list[Channel]] = []
+    for one in channels:
+        if not one.numbers:
+            continue
+        shared = [g for g in groups if isinstance(one, Delayed) and isinstance(g[0], Delayed)
+                  and g[0].delay == one.delay]  # fmt: skip
+        if shared:
+            shared[0].append(one)
+        else:
+            groups.append([one])
+    return groups
+
+
+def _numbers(fit: Fit, group: Sequence[Channel], record: Record) -> Parameters:
+    """Of the numbers that a channel, or a group with the same ones, is made with."""
+    first = group[0]
+    whole = prepared(record, fit.model.channels)
+    fields = list(first.numbers)
+    numbers = [
+        Number(getattr(first, field), _step(first, quantity, whole), quantity.low)
+        for field, quantity in first.numbers.items()
+    ]
+
+    def potential(values: Sequence[float]) -> Potential:
+        changed = {one: replace(one, **dict(zip(fields, values, strict=True))) for one in group}
+        channels = tuple(changed.get(one, one) for one in fit.model.channels)
+        names = {old: new for one in group for old, new in
+                 zip(one.names, changed[one].names, strict=True)}  # fmt: skip
+        scaling = replace(
+            fit.scaling, input_names=tuple(names.get(n, n) for n in fit.scaling.input_names)
+        )
+        model = replace(fit.model, channels=channels, scaling=scaling).collapsed
+        return Potential(model, (record,), fit.mode)
+
+    found = number_posterior(potential, numbers)
+    whose = " and ".join(one.channel for one in group if hasattr(one, "channel"))
+    return {
+        _label(f"{quantity.name} of {whose}" if whose else quantity.name,
+               _unit(first, quantity, whole)): pair
+        for quantity, pair in zip(first.numbers.values(), found, strict=True)
+    }  # fmt: skip
+
+
+def _step(channel: Channel, quantity: Quantity, record: Record) -> float:
+    """How far off a number may easily be: a sample, or a hundredth of the channel's spread."""
+    if quantity.unit == "time":
+        return float(record.sampling_time)
+    return 0.01 * float(np.std(channel.columns(record)))
+
+
+def _unit(channel: Channel, quantity: Quantity, record: Record) -> str:
+    if quantity.unit == "time":
+        return record.time_unit
+    return unit_of(record, str(getattr(channel, "channel", "")))
+
+
+def _moments(values: np.ndarray) -> tuple[float, float]:
+    return float(values.mean()), float(values.std())
+
+
+def _label(name: str, unit: str) -> str:
+    return f"{name} [{unit}]" if unit else name
+
+
+def _ratio(output: str, unit: str) -> str:
+    return f"{output or '1'}/{unit}" if unit else output

@@ -1,0 +1,140 @@
+"""Posterior of what blocks have learnt."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete, lfilter
+
+import pyro_dynogp as dgp
+from pyro_dynogp.channels import DeadZone, Delayed, Play, Recorded, ShiftedClock, Sinusoid, Step
+from pyro_dynogp.discrepancy.extend import with_channel
+from pyro_dynogp.discrepancy.parameters import parameters_of
+from pyro_dynogp.inference.maximum import maximise
+from pyro_dynogp.inference.potential import Potential
+from pyro_dynogp.signals import dead_zone, delayed, play
+
+N, STEP = 160, 0.5
+TIME = STEP * np.arange(N)
+PLAIN = dgp.LinearDynamicGP(inputs=1, pairs=1, process_noise=False)
+# Two poles of natural frequency 1 rad/s and damping ratio 0.5; gain one.
+NUMERATOR, DENOMINATOR, _ = cont2discrete(([1.0], [1.0, 1.0, 1.0]), STEP)
+
+
+def signal(seed, n=N):
+    return lfilter([0.6], [1, -0.8], np.random.default_rng(seed).standard_normal(n))
+
+
+def record_of(seed, acting, **extra):
+    """What acts goes through two poles; its steady-state gain is one. Noise of 5 %."""
+    rng = np.random.default_rng(seed + 100)
+    y = lfilter(NUMERATOR[0], DENOMINATOR, acting) + 0.05 * rng.standard_normal(N)
+    options = {"input_names": ("valve",), "input_units": ("V",), "output_units": ("rpm",)}
+    return dgp.Record(TIME, signal(seed), y, extra=extra, **options)
+
+
+def fitted(model, record):
+    return dgp.fit(model, record, restarts=2, workers=1, progress=False)
+
+
+def test_a_dead_time_has_the_posterior_that_refits_at_every_delay_give():
+    u = signal(0)
+    record = record_of(0, delayed(u, TIME, 1.3))
+    channel = Delayed("valve", 1.2)
+    fit = fitted(with_channel(PLAIN, channel), record)
+    ((label, (mean, sd)),) = parameters_of(fit, [channel], record).items()
+    assert label == "dead time of valve [s]"
+    delays = mean + sd * np.linspace(-3.5, 3.5, 9)
+    heights = []
+    for delay in delays:
+        model = replace(fit.model, channels=(replace(channel, delay=float(delay)),))
+        (best,) = maximise(model, record, [dict(fit.mode)], steps=200, workers=1)
+        potential = Potential(model, (record,), best.values)
+        heights.append(potential.log_evidence(best.values, widest=3.0))
+    share = np.exp(np.array(heights) - max(heights))
+    share /= share.sum()
+    expected = share @ delays
+    assert mean == pytest.approx(expected, abs=0.2 * sd)
+    assert sd == pytest.approx(np.sqrt(share @ (delays - expected) ** 2), rel=0.15)
+
+
+CASES = {
+    "dead time": (
+        lambda u, x: delayed(u, TIME, 1.0 + x), lambda x: Delayed("valve", 1.1 + x),
+        {"dead time of valve [s]": 1.0},
+    ),
+    "dead zone": (
+        lambda u, x: dead_zone(u, x - 0.8, x), lambda x: DeadZone("valve", x - 0.85, x - 0.05),
+        {"lower limit of valve [V]": -0.8, "upper limit of valve [V]": 0.0},
+    ),
+    "play": (
+        lambda u, x: play(u, 0.3 + x), lambda x: Play("valve", 0.25 + x),
+        {"play of valve [V]": 0.3},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_numbers_cover_the_truth(name):
+    """Over records and truths: errors in standard deviations are standard normal.
+
+    Within a sample a dead time can hardly be told from other numerators: its posterior is right on
+    average over such truths, not for each.
+    """
+    acts, start, truth = CASES[name]
+    errors = []
+    for seed in range(6 // len(truth)):
+        x = float(np.random.default_rng(seed).uniform(0.0, 1.0))
+        record, channel = record_of(seed, acts(signal(seed), x)), start(x)
+        fit = fitted(with_channel(PLAIN, channel), record)
+        found = parameters_of(fit, [channel], record)
+        assert list(found) == list(truth)
+        errors += [(found[k][0] - truth[k] - x) / found[k][1] for k in truth]
+    assert np.max(np.abs(errors)) < 4.0
+    # 99.9 % range of the root mean square of six standard normal numbers.
+    assert 0.25 < np.sqrt(np.mean(np.square(errors))) < 1.95
+
+
+def test_instant_and_period_of_what_acts_at_once():
+    u = signal(3)
+    y = 0.4 * (TIME >= 31.0)
+    record = record_of(3, u)
+    record = record.with_outputs(record.outputs[:, 0] + y)
+    step = Step(30.0)
+    fit = fitted(with_channel(PLAIN, step), record)
+    found = parameters_of(fit, [step], record)
+    assert list(found) == ["step at 30 [rpm]", "instant [s]"]
+    assert found["instant [s]"][0] == pytest.approx(31.0, abs=1.0)
+    assert found["instant [s]"][1] < 0.5
+    record = record_of(4, signal(4))
+    record = record.with_outputs(record.outputs[:, 0] + 0.3 * np.sin(2 * np.pi * TIME / 7.3))
+    wave = Sinusoid(7.2)
+    found = parameters_of(fitted(with_channel(PLAIN, wave), record), [wave], record)
+    mean, sd = found["period [s]"]
+    assert mean == pytest.approx(7.3, abs=4.0 * sd)
+    # Cramer-Rao bound of a frequency in white noise (Rife & Boorstyn, 1974).
+    amplitude, noise = 0.3, 0.05
+    bound = np.sqrt(24.0) * noise / (amplitude * 2 * np.pi * TIME[-1] * np.sqrt(N)) * 7.3**2
+    assert 0.7 * bound < sd < 2.5 * bound
+
+
+def test_a_shifted_clock():
+    u = signal(5)
+    acting = np.where(TIME >= 40.0, delayed(u, TIME, -1.5), u)
+    record = record_of(5, acting)
+    channel = ShiftedClock("valve", 1.4, (40.0,))
+    found = parameters_of(fitted(with_channel(PLAIN, channel), record), [channel], record)
+    mean, sd = found["clock shift of valve [s]"]
+    assert mean == pytest.approx(1.5, abs=4.0 * sd)
+    assert sd < 0.2
+
+
+def test_gain_of_an_extra_input():
+    heat = signal(77)
+    record = record_of(6, signal(6) + 0.5 * heat, heat=heat)
+    channel = Recorded("heat")
+    found = parameters_of(fitted(with_channel(PLAIN, channel), record), [channel], record)
+    ((label, (mean, sd)),) = found.items()
+    assert label == "steady-state gain of heat [rpm]"
+    assert mean == pytest.approx(0.5, abs=4.0 * sd)
+    assert 0.0 < sd < 0.1

@@ -1,0 +1,102 @@
+"""Posterior of numbers that a model is made with."""
+
+import numpy as np
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+from scipy import stats
+
+from pyro_dynogp.inference.number import Number, number_posterior
+from pyro_dynogp.inference.potential import Potential
+
+TIME = np.linspace(0.0, 4.0, 30)
+SD = 0.3
+
+
+def column(values):
+    """A bump of some place and, with a second number, width."""
+    place, width = (*values, 1.0)[:2]
+    return np.exp(-0.5 * ((TIME - place) / width) ** 2)
+
+
+def data(seed, *truth):
+    rng = np.random.default_rng(seed)
+    return 1.2 * column(truth) + SD * rng.standard_normal(len(TIME))
+
+
+def potential_of(y):
+    """Gain normal, noise known: given the numbers everything is normal."""
+
+    def at(values):
+        x = torch.tensor(column(values))
+
+        def model():
+            gain = pyro.sample("gain", dist.Normal(torch.tensor(0.0).double(), 1.0))
+            pyro.sample("y", dist.Normal(gain * x, SD).to_event(1), obs=torch.tensor(y))
+
+        return Potential(model, (), {"gain": torch.tensor(1.0).double()})
+
+    return at
+
+
+def exact(y, grids):
+    """Mean and sd of each number from the marginal density on a fine grid."""
+    mesh = np.stack([g.ravel() for g in np.meshgrid(*grids, indexing="ij")], -1)
+    eye = SD**2 * np.eye(len(y))
+    heights = np.array([
+        stats.multivariate_normal(np.zeros(len(y)), eye + np.outer(x, x)).logpdf(y)
+        for x in (column(values) for values in mesh)
+    ])  # fmt: skip
+    share = np.exp(heights - heights.max())
+    share /= share.sum()
+    mean = share @ mesh
+    return mean, np.sqrt(share @ (mesh - mean) ** 2)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_one_number_against_quadrature(seed):
+    y = data(seed, 1.7)
+    ((mean, sd),) = number_posterior(potential_of(y), [Number(1.9, 1e-3)])
+    expected = exact(y, [np.linspace(0.5, 3.0, 600)])
+    # The curvature for the gain is taken to be the same at every place; it varies a little.
+    assert mean == pytest.approx(float(expected[0][0]), abs=0.1 * sd)
+    assert sd == pytest.approx(float(expected[1][0]), rel=0.05)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_numbers_against_quadrature(seed):
+    y = data(seed, 1.7, 0.6)
+    found = number_posterior(potential_of(y), [Number(1.7, 0.1), Number(0.6, 0.1, low=0.05)])
+    expected = exact(y, [np.linspace(0.6, 2.8, 90), np.linspace(0.05, 1.8, 90)])
+    for k, (mean, sd) in enumerate(found):
+        assert mean == pytest.approx(float(expected[0][k]), abs=0.2 * sd)
+        assert sd == pytest.approx(float(expected[1][k]), rel=0.15)
+
+
+def test_the_first_guess_of_its_spread_does_not_matter():
+    y = data(5, 1.7)
+    pairs = [number_posterior(potential_of(y), [Number(1.8, step)])[0] for step in (1e-4, 0.1, 2.0)]
+    for pair in pairs[1:]:
+        assert pair == pytest.approx(pairs[0], rel=0.02)
+
+
+def test_a_bound_is_kept():
+    y = data(6, 0.05)
+    ((mean, sd),) = number_posterior(potential_of(y), [Number(0.1, 0.05, low=0.0)])
+    expected = exact(y, [np.linspace(0.0, 2.5, 600)])
+    assert mean == pytest.approx(float(expected[0][0]), abs=0.15 * sd)
+    assert sd == pytest.approx(float(expected[1][0]), rel=0.1)
+
+
+def test_intervals_cover_the_truth_as_often_as_they_say():
+    rng = np.random.default_rng(0)
+    z = []
+    for seed in range(200):
+        truth = float(rng.uniform(1.2, 2.8))
+        ((mean, sd),) = number_posterior(potential_of(data(seed, truth)), [Number(truth, 0.05)])
+        z.append((mean - truth) / sd)
+    inside = np.mean(np.abs(z) < 1.645)
+    # 200 intervals of 90 %: three standard errors of such a share.
+    assert inside == pytest.approx(0.9, abs=3 * np.sqrt(0.09 / 200))
+    assert np.std(z) == pytest.approx(1.0, abs=0.16)
