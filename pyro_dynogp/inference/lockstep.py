@@ -15,8 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 Result = TypeVar("Result")
-# Value and gradient (d,) at a point (d,); values (k,) and gradients (k, d) at points (k, d).
-Function = Callable[[np.ndarray], tuple[float, np.ndarray]]
+# Values (k,) and gradients (k, d) at points (k, d).
 Functions = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
@@ -24,27 +23,29 @@ class _StoppedError(Exception):
     """Raised in an optimiser's thread when there will be no answer."""
 
 
-def in_lockstep(functions: Functions, runs: Sequence[Callable[[Function], Result]]) -> list[Result]:
-    """Results of optimisers, in their order; each is called with the function to minimise.
+def in_lockstep(
+    functions: Functions, runs: Sequence[Callable[[Functions], Result]]
+) -> list[Result]:
+    """Results of optimisers, in their order; each is called with the functions to minimise.
 
     The points of one evaluation are in the order of the optimisers: the same runs, the same bits.
     An error in one of them, or in the function, ends all and is raised here.
     """
     if len(runs) == 1:
-        return [runs[0](lambda z: _first(functions(z[None])))]
+        return [runs[0](functions)]
     asked: SimpleQueue[tuple[int, str, Any]] = SimpleQueue()
-    answers: list[SimpleQueue[tuple[float, np.ndarray] | None]] = [SimpleQueue() for _ in runs]
+    answers: list[SimpleQueue[tuple[np.ndarray, np.ndarray] | None]] = [SimpleQueue() for _ in runs]
 
     def work(i: int) -> None:
-        def function(z: np.ndarray) -> tuple[float, np.ndarray]:
-            asked.put((i, "point", np.array(z, dtype=float)))
+        def waiting(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            asked.put((i, "points", np.array(z, dtype=float)))
             answer = answers[i].get()
             if answer is None:
                 raise _StoppedError
             return answer
 
         try:
-            asked.put((i, "result", runs[i](function)))
+            asked.put((i, "result", runs[i](waiting)))
         except _StoppedError:
             return
         except BaseException as error:  # raised again in the caller's thread
@@ -61,19 +62,17 @@ def in_lockstep(functions: Functions, runs: Sequence[Callable[[Function], Result
                 i, what, content = asked.get()
                 if what == "error":
                     raise content
-                (points if what == "point" else results)[i] = content
+                (points if what == "points" else results)[i] = content
             if points:
                 order = sorted(points)
-                values, gradients = functions(np.stack([points[i] for i in order]))
-                for i, value, gradient in zip(order, values, gradients, strict=True):
-                    answers[i].put((float(value), gradient))
+                values, gradients = functions(np.concatenate([points[i] for i in order]))
+                ends = np.cumsum([len(points[i]) for i in order])[:-1]
+                parts = zip(np.split(values, ends), np.split(gradients, ends), strict=True)
+                for i, part in zip(order, parts, strict=True):
+                    answers[i].put(part)
     finally:
         for answer in answers:
             answer.put(None)
         for thread in threads:
             thread.join()
     return [results[i] for i in range(len(runs))]
-
-
-def _first(found: tuple[np.ndarray, np.ndarray]) -> tuple[float, np.ndarray]:
-    return float(found[0][0]), found[1][0]

@@ -19,14 +19,17 @@ from pyro_dynogp.inference.checkpoints import (
     tensor_text,
     text_tensor,
 )
-from pyro_dynogp.inference.lockstep import Function, in_lockstep
-from pyro_dynogp.inference.potential import Potential
+from pyro_dynogp.inference.lockstep import Functions, in_lockstep
+from pyro_dynogp.inference.potential import STEP, Potential
 from pyro_dynogp.parallel import parallel_map, seeded
 from pyro_dynogp.record import Record, as_records
 
 Optimizer = Literal["lbfgs", "adam"]
 # Adam's first step, and how often it goes back to the best point with a shorter one.
 RATE, RETURNS = 0.02, 2
+# Iterations of L-BFGS after which its coordinates are made round again, and the gain [nats] in so
+# many of them below which it has arrived.
+ROUND, SMALL = 24, 1e-3
 # Starts that climb together, as long as they have no more samples than this in all: longer records
 # keep a processor busy one by one.
 TOGETHER, BATCH_SAMPLES = 4, 8000
@@ -65,28 +68,66 @@ class _Task:
 
 
 def _lbfgs(
-    function: Function, z: np.ndarray, steps: int, rate: float
+    functions: Functions, z: np.ndarray, steps: int, rate: float, each: int
 ) -> tuple[np.ndarray, list, str]:
+    """L-BFGS in coordinates that are made round again every `each` iterations.
+
+    The sites of dynamic systems make long bent valleys, in which a quasi-Newton method that begins
+    with a sphere goes on for hundreds of iterations. Absolute values of the Hessian's eigenvalues
+    lead away from saddles (Dauphin et al., NeurIPS 2014).
+    """
     del rate  # its line search finds the step
     history: list[float] = []
-    result = minimize(
+    while len(history) < steps:
+        z, done, message = _round(functions, z, min(each, steps - len(history)))
+        history += done
+        if not done or done[0] - done[-1] < SMALL:
+            return z, history, message
+    return z, history, "all steps used"
+
+
+def _round(functions: Functions, z: np.ndarray, count: int) -> tuple[np.ndarray, list[float], str]:
+    """So many iterations of L-BFGS in round coordinates x of z + root x."""
+    root = _rounding(functions, z)
+    history: list[float] = []
+
+    def function(x: np.ndarray) -> tuple[float, np.ndarray]:
+        values, gradients = functions((z + root @ x)[None])
+        return float(values[0]), root.T @ gradients[0]
+
+    found = minimize(
         function,
-        z,
+        np.zeros(len(z)),
         jac=True,
         method="L-BFGS-B",
         callback=lambda intermediate_result: history.append(float(intermediate_result.fun)),
-        options={"maxiter": steps, "maxfun": 2 * steps, "maxcor": 20, "ftol": 1e-7},
+        options={"maxiter": count, "maxfun": 2 * count, "maxcor": 20, "ftol": 1e-9},
     )
-    return result.x, history, str(result.message)
+    return z + root @ found.x, history, str(found.message)
+
+
+def _rounding(functions: Functions, z: np.ndarray) -> np.ndarray:
+    """Root (d, d) of the inverse of the Hessian at z with the sizes of its eigenvalues.
+
+    Directions that are flatter than a standard deviation of one keep their scale. Differences on
+    one side are exact enough for coordinates.
+    """
+    shifted = np.concatenate([z[None], z + STEP * np.eye(len(z))])
+    gradients = functions(shifted)[1]
+    H = (gradients[1:] - gradients[0]) / STEP
+    H = np.nan_to_num(0.5 * (H + H.T))
+    eigenvalues, vectors = np.linalg.eigh(H)
+    return np.asarray(vectors / np.sqrt(np.maximum(np.abs(eigenvalues), 1.0)))
 
 
 def _adam(
-    function: Function, z: np.ndarray, steps: int, rate: float
+    functions: Functions, z: np.ndarray, steps: int, rate: float, each: int
 ) -> tuple[np.ndarray, list, str]:
     """Adam with a falling step; back to the best point with a shorter one where it got lost.
 
     Its first steps have full length in every direction, however good the start is.
     """
+    del each  # it knows no curvature
     x, optimizer, schedule = _from(z, rate, steps)
     history: list[float] = []
     best, best_z = np.inf, z
@@ -94,7 +135,8 @@ def _adam(
     since, returns = 0, 0
     for done in range(steps):
         here = x.detach().numpy().copy()
-        value, gradient = function(here)
+        values, gradients = functions(here[None])
+        value = float(values[0])
         history.append(value)
         since += 1
         if value < best - 1e-3:
@@ -107,7 +149,7 @@ def _adam(
             returns, since, rate = returns + 1, 0, rate / 4.0
             x, optimizer, schedule = _from(best_z, rate, steps - done)
             continue
-        x.grad = torch.tensor(gradient)
+        x.grad = torch.tensor(gradients[0])
         optimizer.step()
         schedule.step()
     return best_z, history, "all steps used"
@@ -133,9 +175,12 @@ def _climb(task: _Task) -> list[Optimum]:
         potential = Potential(task.model, (task.records,), task.starts[0])
         method = _METHODS[task.optimizer]
 
-        def run(start: dict[str, Tensor]) -> Callable[[Function], tuple[np.ndarray, list, str]]:
+        # A Hessian should cost no more than the iterations that it serves.
+        each = max(ROUND, -(-potential.size // potential.width))
+
+        def run(start: dict[str, Tensor]) -> Callable[[Functions], tuple[np.ndarray, list, str]]:
             z = potential.pack(start).numpy()
-            return lambda function: method(function, z, task.steps, task.rate)
+            return lambda functions: method(functions, z, task.steps, task.rate, each)
 
         found = in_lockstep(potential.values_and_gradients, [run(start) for start in task.starts])
         ends = np.stack([z for z, _, _ in found])

@@ -19,6 +19,14 @@ from torch.distributions.transforms import Transform
 from pyro_dynogp._errors import invalid
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
 
+# Energy where there is no density.
+WALL = 1e15
+# Samples in all, over the points of a batch, up to which more points cost less than one by one:
+# above, the compiled recursions are what an evaluation costs.
+AT_ONCE = 12_000
+# Of central differences, in unconstrained units.
+STEP = 1e-4
+
 
 @dataclass(frozen=True)
 class Site:
@@ -229,18 +237,19 @@ class Potential:
         values[np.isinf(values)] = WALL
         return values, torch.cat([gradient for _, gradient in found]).numpy()
 
-    def hessian(self, z: np.ndarray, *, step: float = 1e-4) -> np.ndarray:
+    def hessian(self, z: np.ndarray, *, step: float = STEP) -> np.ndarray:
         """Hessian (d, d) of the energy with Jacobian, by central differences of the gradient."""
         return self.hessian_of(z, range(z.shape[0]), step=step)
 
-    def hessian_of(self, z: np.ndarray, some: Sequence[int], *, step: float = 1e-4) -> np.ndarray:
+    def hessian_of(self, z: np.ndarray, some: Sequence[int], *, step: float = STEP) -> np.ndarray:
         """Rows and columns of `hessian` that belong to some entries of z."""
-        shifts = np.zeros((len(some), z.shape[0]))
-        shifts[np.arange(len(some)), list(some)] = step
+        places = list(some)
+        shifts = np.zeros((len(places), len(z)))
+        shifts[np.arange(len(places)), places] = step
         both = np.concatenate([z + shifts, z - shifts])
         up, down = np.split(self.values_and_gradients(both, jacobian=True)[1], 2)
-        H = ((up - down) / (2.0 * step))[:, list(some)]
-        return 0.5 * (H + H.T)
+        H = ((up - down) / (2.0 * step))[:, places]
+        return np.asarray(0.5 * (H + H.T))
 
     def log_evidence(self, values: Mapping[str, Tensor], *, widest: float) -> float:
         """Laplace's approximation of log p(y) from the neighbourhood of `values` alone [nats].
@@ -272,11 +281,6 @@ class Potential:
         return result.x, laplace_root(self.hessian(result.x), widest=widest)
 
 
-# Energy where there is no density.
-WALL = 1e15
-# Samples in all, over the points of a batch, up to which more points cost less than one by one:
-# above, the compiled recursions are what an evaluation costs.
-AT_ONCE = 12_000
 # Unconstrained value of what lies on a boundary: within 1e-13 of it.
 EDGE = 30.0
 

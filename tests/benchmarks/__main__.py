@@ -20,6 +20,7 @@ from tests.benchmarks import (
     electricity,
     example2,
     guides,
+    loop_cost,
     measured,
     planted,
     reference,
@@ -45,6 +46,7 @@ PARTS = {
     "brute_force": brute_force.run,
     "planted": planted.run,
     "measured": measured.run,
+    "loop_cost": loop_cost.run,
     "paper": paper.run,
     "growth": growth.run,
 }

@@ -80,6 +80,7 @@ def test_the_report_can_be_kept_and_read(found: Any, tmp_path: Path) -> None:
     again = dgp.load(tmp_path / "fit.safetensors")
     assert again.model.channels == found.fit.model.channels
     assert "extra input" in str(found)
+    assert "   steady-state gain of heat [rpm]: " in str(found)
 
 
 def test_units_and_the_order_of_channels_do_not_matter(found: Any) -> None:

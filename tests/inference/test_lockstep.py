@@ -10,7 +10,11 @@ from pyro_dynogp.inference.lockstep import in_lockstep
 
 
 def run(start):
-    def climb(function):
+    def climb(functions):
+        def function(z):
+            values, gradients = functions(z[None])
+            return values[0], gradients[0]
+
         found = minimize(function, start, jac=True, method="L-BFGS-B")
         return found.x, found.nfev
 
@@ -45,11 +49,34 @@ def test_points_are_in_the_order_of_the_runs():
         return z[:, 0], z
 
     def one(value):
-        return lambda function: [function(np.full(1, value + k))[0] for k in range(20)]
+        return lambda functions: [functions(np.full((1, 1), value + k))[0][0] for k in range(20)]
 
     found = in_lockstep(functions, [one(100.0 * i) for i in range(6)])
     for i, values in enumerate(found):
         assert values == [100.0 * i + k for k in range(20)]
+
+
+def test_runs_may_ask_for_many_points():
+    """Each gets back the values of its own."""
+    sizes = []
+
+    def functions(z):
+        sizes.append(len(z))
+        return z.sum(1), 2.0 * z
+
+    def many(count):
+        def climb(functions):
+            points = np.arange(2.0 * count).reshape(count, 2)
+            values, gradients = functions(points)
+            np.testing.assert_array_equal(gradients, 2.0 * points)
+            return values
+
+        return climb
+
+    for count, values in zip((3, 1, 5), in_lockstep(functions, [many(3), many(1), many(5)]),
+                             strict=True):  # fmt: skip
+        np.testing.assert_array_equal(values, 4.0 * np.arange(count) + 1.0)
+    assert sizes == [9]
 
 
 @pytest.mark.parametrize("where", ["function", "run"])
@@ -59,13 +86,13 @@ def test_an_error_ends_all_and_is_raised(where):
             raise RuntimeError("broken")
         return z[:, 0], z
 
-    def ends(function):
-        function(np.zeros(1))
+    def ends(functions):
+        functions(np.zeros((1, 1)))
         raise RuntimeError("broken")
 
-    def waits(function):
+    def waits(functions):
         for _ in range(1000):
-            function(np.ones(1))
+            functions(np.ones((2, 1)))
 
     threads = threading.active_count()
     with pytest.raises(RuntimeError, match="broken"):
