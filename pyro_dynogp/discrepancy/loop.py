@@ -19,7 +19,7 @@ from pyro_dynogp.discrepancy.evidence import Residuals
 from pyro_dynogp.discrepancy.extend import Model, has_function, used_channels
 from pyro_dynogp.discrepancy.gate import structure_left
 from pyro_dynogp.discrepancy.noise_effects import data_faults
-from pyro_dynogp.discrepancy.parameters import parameters_of
+from pyro_dynogp.discrepancy.parameters import limits_of, parameters_of
 from pyro_dynogp.discrepancy.report import Attempt, FoundEffect, Report
 from pyro_dynogp.discrepancy.residuals import residuals_of
 from pyro_dynogp.discrepancy.search import Found, candidates_of, look, merged
@@ -380,6 +380,8 @@ def _effect(found: Found, confirmed: Confirmed, extended: Fit, record: Record) -
     assert confirmed.model is not None
     own = [one for one in confirmed.model.channels if one not in confirmed.before.channels]
     lines = [words.in_words(one) for one in own] or words.describe(confirmed.model)
+    parameters = parameters_of(extended, own, record)
+    parameters |= limits_of(extended, found.evidence, record)
     return FoundEffect(
         name=found.effect.name,
         sentence=found.effect.sentence(found.evidence, confirmed.model),
@@ -388,7 +390,8 @@ def _effect(found: Found, confirmed: Confirmed, extended: Fit, record: Record) -
         gain=attempt.gain,
         gain_error=attempt.gain_error,
         size=found.evidence.size,
-        parameters=parameters_of(extended, own, record),
+        parameters=parameters_of(extended, own, record)
+        | limits_of(extended, found.evidence, record),
         block="; ".join(lines),
         curve=found.evidence.curve,
         ties=confirmed.ties,

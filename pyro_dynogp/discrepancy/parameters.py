@@ -15,10 +15,13 @@ from pyro_dynogp.criticism.posterior_draws import draws_of
 from pyro_dynogp.inference.number import Number, number_posterior
 from pyro_dynogp.inference.potential import Potential
 from pyro_dynogp.lti.views import steady_state_gain
+from pyro_dynogp.models.cascade import Cascade
+from pyro_dynogp.models.layers import Static
 from pyro_dynogp.models.linear import LinearDynamicGP
 from pyro_dynogp.record import Record
 
 if TYPE_CHECKING:
+    from pyro_dynogp.discrepancy.evidence import Evidence
     from pyro_dynogp.inference.result import Fit
 
 Parameters = dict[str, tuple[float, float]]
@@ -44,6 +47,32 @@ def parameters_of(fit: Fit, channels: Sequence[Channel], record: Record) -> Para
         out |= _weights(fit, acting, drawn) | _gains(fit, acting, drawn)
     for group in _together(present):
         out |= _numbers(fit, group, record)
+    return out
+
+
+def limits_of(fit: Fit, evidence: Evidence, record: Record) -> Parameters:
+    """Limits of a sensor that stops: its function where that is highest, or lowest.
+
+    Posterior mean and standard deviation of the function [output] where it is best known of where
+    it is at its limit to within a standard deviation; of the limits that the evidence has.
+    """
+    if evidence.effect != "saturation" or not isinstance(fit.model, Cascade):
+        return {}
+    if not isinstance(fit.model.layers[-1], Static):
+        return {}
+    band = fit.static_function(fit.model.wires[-1].name, record)
+    seen = (band.x >= band.inputs.min()) & (band.x <= band.inputs.max())
+    mean, sd = band.mean[seen, 0], band.sd[seen, 0]
+    scale, offset = fit.scaling.output_scale[0], fit.scaling.output_offset[0]
+    out: Parameters = {}
+    for end, sign in (("low", -1.0), ("high", 1.0)):
+        if np.isfinite(float(evidence.where[end])):
+            name = "lower limit" if end == "low" else "upper limit"
+            top = int((sign * mean).argmax())
+            flat = sign * mean >= sign * mean[top] - sd[top]
+            at = int(np.where(flat, sd, np.inf).argmin())
+            pair = float(offset + scale * mean[at]), float(scale * sd[at])
+            out[_label(name, fit.scaling.output_units[0])] = pair
     return out
 
 

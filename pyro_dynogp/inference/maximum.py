@@ -27,8 +27,8 @@ from pyro_dynogp.record import Record, as_records
 Optimizer = Literal["lbfgs", "adam"]
 # Adam's first step, and how often it goes back to the best point with a shorter one.
 RATE, RETURNS = 0.02, 2
-# Iterations of L-BFGS after which its coordinates are made round again, and the gain [nats] in so
-# many of them below which it has arrived.
+# Iterations of L-BFGS, at least, after which its coordinates are made round again, and the gain
+# [nats] in so many of them below which it has arrived.
 ROUND, SMALL = 24, 1e-3
 # Starts that climb together, as long as they have no more samples than this in all: longer records
 # keep a processor busy one by one.
@@ -68,27 +68,32 @@ class _Task:
 
 
 def _lbfgs(
-    functions: Functions, z: np.ndarray, steps: int, rate: float, each: int
+    functions: Functions, z: np.ndarray, steps: int, rate: float, price: int
 ) -> tuple[np.ndarray, list, str]:
-    """L-BFGS in coordinates that are made round again every `each` iterations.
+    """L-BFGS in coordinates that are made round again and again.
 
     The sites of dynamic systems make long bent valleys, in which a quasi-Newton method that begins
     with a sphere goes on for hundreds of iterations. Absolute values of the Hessian's eigenvalues
-    lead away from saddles (Dauphin et al., NeurIPS 2014).
+    lead away from saddles (Dauphin et al., NeurIPS 2014). A Hessian, which costs as much as `price`
+    iterations, serves at least as many; where fewer are left there is none.
     """
     del rate  # its line search finds the step
     history: list[float] = []
     while len(history) < steps:
-        z, done, message = _round(functions, z, min(each, steps - len(history)))
+        left = steps - len(history)
+        root = _rounding(functions, z) if price <= left else np.eye(len(z))
+        count = min(max(ROUND, price), left)
+        z, done, message = _round(functions, z, root, count)
         history += done
         if not done or done[0] - done[-1] < SMALL:
             return z, history, message
     return z, history, "all steps used"
 
 
-def _round(functions: Functions, z: np.ndarray, count: int) -> tuple[np.ndarray, list[float], str]:
-    """So many iterations of L-BFGS in round coordinates x of z + root x."""
-    root = _rounding(functions, z)
+def _round(
+    functions: Functions, z: np.ndarray, root: np.ndarray, count: int
+) -> tuple[np.ndarray, list[float], str]:
+    """So many iterations of L-BFGS in coordinates x of z + root x."""
     history: list[float] = []
 
     def function(x: np.ndarray) -> tuple[float, np.ndarray]:
@@ -121,13 +126,13 @@ def _rounding(functions: Functions, z: np.ndarray) -> np.ndarray:
 
 
 def _adam(
-    functions: Functions, z: np.ndarray, steps: int, rate: float, each: int
+    functions: Functions, z: np.ndarray, steps: int, rate: float, price: int
 ) -> tuple[np.ndarray, list, str]:
     """Adam with a falling step; back to the best point with a shorter one where it got lost.
 
     Its first steps have full length in every direction, however good the start is.
     """
-    del each  # it knows no curvature
+    del price  # it knows no curvature
     x, optimizer, schedule = _from(z, rate, steps)
     history: list[float] = []
     best, best_z = np.inf, z
@@ -175,12 +180,12 @@ def _climb(task: _Task) -> list[Optimum]:
         potential = Potential(task.model, (task.records,), task.starts[0])
         method = _METHODS[task.optimizer]
 
-        # A Hessian should cost no more than the iterations that it serves.
-        each = max(ROUND, -(-potential.size // potential.width))
+        # Iterations that a Hessian costs: points that are evaluated at once cost a third or less.
+        price = -(-potential.size // min(potential.width, 3))
 
         def run(start: dict[str, Tensor]) -> Callable[[Functions], tuple[np.ndarray, list, str]]:
             z = potential.pack(start).numpy()
-            return lambda functions: method(functions, z, task.steps, task.rate, each)
+            return lambda functions: method(functions, z, task.steps, task.rate, price)
 
         found = in_lockstep(potential.values_and_gradients, [run(start) for start in task.starts])
         ends = np.stack([z for z, _, _ in found])

@@ -8,8 +8,9 @@ from scipy.signal import cont2discrete, lfilter
 
 import pyro_dynogp as dgp
 from pyro_dynogp.channels import DeadZone, Delayed, Play, Recorded, ShiftedClock, Sinusoid, Step
+from pyro_dynogp.discrepancy.evidence import Evidence
 from pyro_dynogp.discrepancy.extend import with_channel
-from pyro_dynogp.discrepancy.parameters import parameters_of
+from pyro_dynogp.discrepancy.parameters import limits_of, parameters_of
 from pyro_dynogp.inference.maximum import maximise
 from pyro_dynogp.inference.potential import Potential
 from pyro_dynogp.signals import dead_zone, delayed, play
@@ -138,3 +139,23 @@ def test_gain_of_an_extra_input():
     assert label == "steady-state gain of heat [rpm]"
     assert mean == pytest.approx(0.5, abs=4.0 * sd)
     assert 0.0 < sd < 0.1
+
+
+def test_limits_of_a_sensor():
+    u = signal(8)
+    record = record_of(8, u)
+    clipped = np.clip(record.outputs[:, 0], -np.inf, 0.6)
+    record = record.with_outputs(clipped + 0.02 * np.random.default_rng(1).standard_normal(N))
+    model = dgp.Wiener(1, pairs=1, inducing=16, process_noise=False)
+    fit = dgp.fit(model, record, restarts=2, steps=150, workers=1, progress=False)
+    nothing = np.inf
+    found = limits_of(fit, evidence_of({"low": -nothing, "high": 0.61}), record)
+    ((label, (mean, sd)),) = found.items()
+    assert label == "upper limit [rpm]"
+    assert mean == pytest.approx(0.6, abs=4.0 * sd + 0.01)
+    assert 0.0 < sd < 0.05
+    assert limits_of(fit, evidence_of({}, "output nonlinearity"), record) == {}
+
+
+def evidence_of(where, effect="saturation"):
+    return Evidence(effect, 3.0, 0.01, 5.0, 0.1, where, "It stops.")
