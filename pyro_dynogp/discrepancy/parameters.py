@@ -143,7 +143,8 @@ def _numbers(fit: Fit, group: Sequence[Channel], record: Record) -> Parameters:
             fit.scaling, input_names=tuple(names.get(n, n) for n in fit.scaling.input_names)
         )
         model = replace(fit.model, channels=channels, scaling=scaling).collapsed
-        return Potential(model, (record,), fit.mode)
+        # Channels are made once here, not in every evaluation.
+        return Potential(model, model.check(record), fit.mode)
 
     found = number_posterior(potential, numbers)
     whose = " and ".join(one.channel for one in group if hasattr(one, "channel"))

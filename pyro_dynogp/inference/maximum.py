@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -68,21 +69,22 @@ class _Task:
 
 
 def _lbfgs(
-    functions: Functions, z: np.ndarray, steps: int, rate: float, price: int
+    functions: Functions, z: np.ndarray, steps: int, rate: float, price: float
 ) -> tuple[np.ndarray, list, str]:
     """L-BFGS in coordinates that are made round again and again.
 
     The sites of dynamic systems make long bent valleys, in which a quasi-Newton method that begins
     with a sphere goes on for hundreds of iterations. Absolute values of the Hessian's eigenvalues
     lead away from saddles (Dauphin et al., NeurIPS 2014). A Hessian, which costs as much as `price`
-    iterations, serves at least as many; where fewer are left there is none.
+    iterations, serves at least as many; where less than twice as many are left there is none.
     """
     del rate  # its line search finds the step
     history: list[float] = []
     while len(history) < steps:
         left = steps - len(history)
-        root = _rounding(functions, z) if price <= left else np.eye(len(z))
-        count = min(max(ROUND, price), left)
+        dear = 2.0 * price > left
+        root = np.eye(len(z)) if dear else _rounding(functions, z)
+        count = left if dear else min(max(ROUND, math.ceil(price)), left)
         z, done, message = _round(functions, z, root, count)
         history += done
         if not done or done[0] - done[-1] < SMALL:
@@ -126,7 +128,7 @@ def _rounding(functions: Functions, z: np.ndarray) -> np.ndarray:
 
 
 def _adam(
-    functions: Functions, z: np.ndarray, steps: int, rate: float, price: int
+    functions: Functions, z: np.ndarray, steps: int, rate: float, price: float
 ) -> tuple[np.ndarray, list, str]:
     """Adam with a falling step; back to the best point with a shorter one where it got lost.
 
@@ -180,8 +182,7 @@ def _climb(task: _Task) -> list[Optimum]:
         potential = Potential(task.model, (task.records,), task.starts[0])
         method = _METHODS[task.optimizer]
 
-        # Iterations that a Hessian costs: points that are evaluated at once cost a third or less.
-        price = -(-potential.size // min(potential.width, 3))
+        price = potential.size * potential.share
 
         def run(start: dict[str, Tensor]) -> Callable[[Functions], tuple[np.ndarray, list, str]]:
             z = potential.pack(start).numpy()
@@ -280,7 +281,7 @@ def maximise(
             tasks,
             workers=workers,
             progress=progress,
-            description=f"{label}, {len(values)}",
+            description=f"{len(values)} {label}",
             news=lambda done: f"log p {-min(o.energy for batch in done for o in batch):.2f}",
         )
         return [optimum for batch in found for optimum in batch]

@@ -56,6 +56,9 @@ def number_posterior(
     Args:
         potential: of the model with other numbers; its `at` is the fit's mode.
         numbers: as the fit has them.
+
+    Raises:
+        ValueError: where the fitted numbers themselves make no model.
     """
     centre = tuple(one.at for one in numbers)
     steps = np.array([one.step for one in numbers])
@@ -72,7 +75,10 @@ def number_posterior(
             near = min(known, key=lambda one: float(np.sum(((key - np.array(one)) / steps) ** 2)),
                        default=None)  # fmt: skip
             start = z if near is None else known[near][1]
-            known[key] = _lowest(potential(key), start, root)
+            try:
+                known[key] = _lowest(potential(key), start, root)
+            except ValueError:  # numbers that make no model, as limits that cross: no density
+                known[key] = np.inf, start
         return known[key][0]
 
     ranges = [_range(energy, centre, k, one) for k, one in enumerate(numbers)]

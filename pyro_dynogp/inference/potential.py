@@ -24,6 +24,8 @@ WALL = 1e15
 # Samples in all, over the points of a batch, up to which more points cost less than one by one:
 # above, the compiled recursions are what an evaluation costs.
 AT_ONCE = 12_000
+# Samples from which on the compiled recursions cost more than the rest of an evaluation.
+EQUAL = 3700
 # Of central differences, in unconstrained units.
 STEP = 1e-4
 
@@ -173,11 +175,11 @@ class Potential:
                 self.sites.append(Site(name, value.shape, transform.inv(value).shape, transform))
         observed = [node["value"] for node in trace.nodes.values()
                     if node["type"] == "sample" and node["is_observed"]]  # fmt: skip
-        # Points that are evaluated at once.
-        self.width = 1
-        if self.takes_batches:
-            count = sum(y.numel() for y in observed if torch.is_tensor(y))
-            self.width = max(1, AT_ONCE // max(count, 1))
+        count = sum(y.numel() for y in observed if torch.is_tensor(y))
+        # Points that are evaluated at once, and the cost of one of them over that of one alone.
+        self.width = max(1, AT_ONCE // max(count, 1)) if self.takes_batches else 1
+        compiled = count / EQUAL
+        self.share = (1.0 / self.width + compiled) / (1.0 + compiled)
 
     @property
     def size(self) -> int:

@@ -89,6 +89,25 @@ def test_a_bound_is_kept():
     assert sd == pytest.approx(float(expected[1][0]), rel=0.1)
 
 
+def test_numbers_that_make_no_model_have_no_density():
+    """Widths below zero raise; the range ends there as at a bound."""
+    y = data(7, 1.7, 0.3)
+    plain = potential_of(y)
+
+    def strict(values):
+        if values[1] <= 0.2:
+            raise ValueError("too narrow")
+        return plain(values)
+
+    numbers = [Number(1.7, 0.1), Number(0.3, 0.1)]
+    found = number_posterior(strict, numbers)
+    bounded = number_posterior(plain, [numbers[0], Number(0.3, 0.1, low=0.2)])
+    assert found[1][0] > 0.2
+    assert found[1][0] == pytest.approx(bounded[1][0], abs=0.5 * bounded[1][1])
+    with pytest.raises(ValueError, match="too narrow"):
+        number_posterior(strict, [numbers[0], Number(0.1, 0.1)])
+
+
 def test_intervals_cover_the_truth_as_often_as_they_say():
     rng = np.random.default_rng(0)
     z = []
