@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -21,16 +20,13 @@ from pyro_dynogp.inference.checkpoints import (
     text_tensor,
 )
 from pyro_dynogp.inference.lockstep import Functions, in_lockstep
-from pyro_dynogp.inference.potential import STEP, Potential
+from pyro_dynogp.inference.potential import Potential
 from pyro_dynogp.parallel import parallel_map, seeded
 from pyro_dynogp.record import Record, as_records
 
 Optimizer = Literal["lbfgs", "adam"]
 # Adam's first step, and how often it goes back to the best point with a shorter one.
 RATE, RETURNS = 0.02, 2
-# Iterations of L-BFGS, at least, after which its coordinates are made round again, and the gain
-# [nats] in so many of them below which it has arrived.
-ROUND, SMALL = 24, 1e-3
 # Starts that climb together, as long as they have no more samples than this in all: longer records
 # keep a processor busy one by one.
 TOGETHER, BATCH_SAMPLES = 4, 8000
@@ -69,72 +65,33 @@ class _Task:
 
 
 def _lbfgs(
-    functions: Functions, z: np.ndarray, steps: int, rate: float, price: float
+    functions: Functions, z: np.ndarray, steps: int, rate: float
 ) -> tuple[np.ndarray, list, str]:
-    """L-BFGS in coordinates that are made round again and again.
-
-    The sites of dynamic systems make long bent valleys, in which a quasi-Newton method that begins
-    with a sphere goes on for hundreds of iterations. Absolute values of the Hessian's eigenvalues
-    lead away from saddles (Dauphin et al., NeurIPS 2014). A Hessian, which costs as much as `price`
-    iterations, serves at least as many; where less than twice as many are left there is none.
-    """
     del rate  # its line search finds the step
-    history: list[float] = []
-    while len(history) < steps:
-        left = steps - len(history)
-        dear = 2.0 * price > left
-        root = np.eye(len(z)) if dear else _rounding(functions, z)
-        count = left if dear else min(max(ROUND, math.ceil(price)), left)
-        z, done, message = _round(functions, z, root, count)
-        history += done
-        if not done or done[0] - done[-1] < SMALL:
-            return z, history, message
-    return z, history, "all steps used"
-
-
-def _round(
-    functions: Functions, z: np.ndarray, root: np.ndarray, count: int
-) -> tuple[np.ndarray, list[float], str]:
-    """So many iterations of L-BFGS in coordinates x of z + root x."""
     history: list[float] = []
 
     def function(x: np.ndarray) -> tuple[float, np.ndarray]:
-        values, gradients = functions((z + root @ x)[None])
-        return float(values[0]), root.T @ gradients[0]
+        values, gradients = functions(x[None])
+        return float(values[0]), gradients[0]
 
-    found = minimize(
+    result = minimize(
         function,
-        np.zeros(len(z)),
+        z,
         jac=True,
         method="L-BFGS-B",
         callback=lambda intermediate_result: history.append(float(intermediate_result.fun)),
-        options={"maxiter": count, "maxfun": 2 * count, "maxcor": 20, "ftol": 1e-9},
+        options={"maxiter": steps, "maxfun": 2 * steps, "maxcor": 20, "ftol": 1e-7},
     )
-    return z + root @ found.x, history, str(found.message)
-
-
-def _rounding(functions: Functions, z: np.ndarray) -> np.ndarray:
-    """Root (d, d) of the inverse of the Hessian at z with the sizes of its eigenvalues.
-
-    Directions that are flatter than a standard deviation of one keep their scale. Differences on
-    one side are exact enough for coordinates.
-    """
-    shifted = np.concatenate([z[None], z + STEP * np.eye(len(z))])
-    gradients = functions(shifted)[1]
-    H = (gradients[1:] - gradients[0]) / STEP
-    H = np.nan_to_num(0.5 * (H + H.T))
-    eigenvalues, vectors = np.linalg.eigh(H)
-    return np.asarray(vectors / np.sqrt(np.maximum(np.abs(eigenvalues), 1.0)))
+    return result.x, history, str(result.message)
 
 
 def _adam(
-    functions: Functions, z: np.ndarray, steps: int, rate: float, price: float
+    functions: Functions, z: np.ndarray, steps: int, rate: float
 ) -> tuple[np.ndarray, list, str]:
     """Adam with a falling step; back to the best point with a shorter one where it got lost.
 
     Its first steps have full length in every direction, however good the start is.
     """
-    del price  # it knows no curvature
     x, optimizer, schedule = _from(z, rate, steps)
     history: list[float] = []
     best, best_z = np.inf, z
@@ -182,11 +139,9 @@ def _climb(task: _Task) -> list[Optimum]:
         potential = Potential(task.model, (task.records,), task.starts[0])
         method = _METHODS[task.optimizer]
 
-        price = potential.size * potential.share
-
         def run(start: dict[str, Tensor]) -> Callable[[Functions], tuple[np.ndarray, list, str]]:
             z = potential.pack(start).numpy()
-            return lambda functions: method(functions, z, task.steps, task.rate, price)
+            return lambda functions: method(functions, z, task.steps, task.rate)
 
         found = in_lockstep(potential.values_and_gradients, [run(start) for start in task.starts])
         ends = np.stack([z for z, _, _ in found])

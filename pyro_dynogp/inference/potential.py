@@ -24,10 +24,6 @@ WALL = 1e15
 # Samples in all, over the points of a batch, up to which more points cost less than one by one:
 # above, the compiled recursions are what an evaluation costs.
 AT_ONCE = 12_000
-# Samples from which on the compiled recursions cost more than the rest of an evaluation.
-EQUAL = 3700
-# Of central differences, in unconstrained units.
-STEP = 1e-4
 
 
 @dataclass(frozen=True)
@@ -176,10 +172,8 @@ class Potential:
         observed = [node["value"] for node in trace.nodes.values()
                     if node["type"] == "sample" and node["is_observed"]]  # fmt: skip
         count = sum(y.numel() for y in observed if torch.is_tensor(y))
-        # Points that are evaluated at once, and the cost of one of them over that of one alone.
+        # Points that are evaluated at once.
         self.width = max(1, AT_ONCE // max(count, 1)) if self.takes_batches else 1
-        compiled = count / EQUAL
-        self.share = (1.0 / self.width + compiled) / (1.0 + compiled)
 
     @property
     def size(self) -> int:
@@ -239,11 +233,11 @@ class Potential:
         values[np.isinf(values)] = WALL
         return values, torch.cat([gradient for _, gradient in found]).numpy()
 
-    def hessian(self, z: np.ndarray, *, step: float = STEP) -> np.ndarray:
+    def hessian(self, z: np.ndarray, *, step: float = 1e-4) -> np.ndarray:
         """Hessian (d, d) of the energy with Jacobian, by central differences of the gradient."""
         return self.hessian_of(z, range(z.shape[0]), step=step)
 
-    def hessian_of(self, z: np.ndarray, some: Sequence[int], *, step: float = STEP) -> np.ndarray:
+    def hessian_of(self, z: np.ndarray, some: Sequence[int], *, step: float = 1e-4) -> np.ndarray:
         """Rows and columns of `hessian` that belong to some entries of z."""
         places = list(some)
         shifts = np.zeros((len(places), len(z)))
