@@ -13,8 +13,9 @@ NOTEBOOKS = sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
 def test_runs_and_is_cleared(path):
     notebook = nbformat.read(path, as_version=4)
     assert all(not cell.get("outputs") for cell in notebook.cells)
-    # A cell's limit beside other tests; alone, the longest notebook takes two minutes.
-    client = NotebookClient(notebook, timeout=360, kernel_name="python3")
+    # Ends a cell that hangs; it is no measure of speed, and shared machines may be five times slower
+    # than those on which the longest notebook takes two minutes.
+    client = NotebookClient(notebook, timeout=1200, kernel_name="python3")
     client.execute(cwd=str(path.parent))
     assert any(
         "image/png" in output.get("data", {})
