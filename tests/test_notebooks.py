@@ -13,7 +13,7 @@ NOTEBOOKS = sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
 def test_runs_and_is_cleared(path):
     notebook = nbformat.read(path, as_version=4)
     assert all(not cell.get("outputs") for cell in notebook.cells)
-    # Ends a cell that hangs; it is no measure of speed, and shared machines may be five times slower
+    # Ends a cell that hangs, and is no measure of speed: shared machines may be five times slower
     # than those on which the longest notebook takes two minutes.
     client = NotebookClient(notebook, timeout=1200, kernel_name="python3")
     client.execute(cwd=str(path.parent))
