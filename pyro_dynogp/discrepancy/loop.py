@@ -390,8 +390,7 @@ def _effect(found: Found, confirmed: Confirmed, extended: Fit, record: Record) -
         gain=attempt.gain,
         gain_error=attempt.gain_error,
         size=found.evidence.size,
-        parameters=parameters_of(extended, own, record)
-        | limits_of(extended, found.evidence, record),
+        parameters=parameters,
         block="; ".join(lines),
         curve=found.evidence.curve,
         ties=confirmed.ties,

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize
 
-from pyro_dynogp.inference.potential import WALL, Potential
+from pyro_dynogp.inference.potential import WALL, Potential, laplace_root
 
 # Nats below the top at which the density counts as zero; points of the grid for one number and for
 # each of two; how often a range is doubled or halved to find that depth.
@@ -64,8 +64,7 @@ def number_posterior(
     steps = np.array([one.step for one in numbers])
     first = potential(centre)
     z = first.pack(first.at).numpy()
-    eigenvalues, vectors = np.linalg.eigh(first.hessian(z))
-    root = vectors / np.sqrt(np.maximum(eigenvalues, WIDEST**-2))
+    root = laplace_root(first.hessian(z), widest=WIDEST)
     known: dict[tuple[float, ...], tuple[float, np.ndarray]] = {}
 
     def energy(values: Sequence[float]) -> float:

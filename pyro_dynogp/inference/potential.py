@@ -150,7 +150,6 @@ class Potential:
         self, model: Callable[..., Any], args: tuple[Any, ...], values: Mapping[str, Tensor]
     ) -> None:
         self.model, self.args, self.at = model, args, dict(values)
-        self.takes_batches = bool(getattr(model, "takes_batches", False))
         trace = pyro.poutine.trace(pyro.poutine.condition(model, data=dict(values))).get_trace(
             *args
         )
@@ -173,7 +172,8 @@ class Potential:
                     if node["type"] == "sample" and node["is_observed"]]  # fmt: skip
         count = sum(y.numel() for y in observed if torch.is_tensor(y))
         # Points that are evaluated at once.
-        self.width = max(1, AT_ONCE // max(count, 1)) if self.takes_batches else 1
+        batches = getattr(model, "takes_batches", False)
+        self.width = max(1, AT_ONCE // max(count, 1)) if batches else 1
 
     @property
     def size(self) -> int:

@@ -1,6 +1,6 @@
 """Simulation-based calibration of fits: a small run, what it draws, what fails, what is refused."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -110,7 +110,7 @@ def test_an_overconfident_posterior_is_rejected(model, blank, monkeypatch, width
 
 def test_outputs_of_a_cascade_come_from_its_trajectories(blank):
     wiener = dgp.Wiener(1, pairs=1, inducing=4).scaled_to(blank)
-    fixed = _FixedCascade(**{f: getattr(wiener, f) for f in wiener.__dataclass_fields__})
+    fixed = _FixedCascade(**{f.name: getattr(wiener, f.name) for f in fields(wiener)})
     blind = blank.with_outputs(np.empty((24, 0)), names=(), units=())
     truth, record = _simulated(_Task(fixed, blind, blank.missing, "svi", 19, 3, {}))
     assert {"g", "f", "f_values", "g_initial_state"} <= set(truth)

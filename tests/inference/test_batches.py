@@ -60,6 +60,7 @@ def test_values_and_gradients_of_a_batch(name, jacobian):
     for value, gradient, point in zip(values, gradients, z, strict=True):
         alone, slope = potential.value_and_gradient(point, jacobian=jacobian)
         assert np.isfinite(alone)
+        # Vectorised sums round by the shape of what they add.
         assert value == pytest.approx(alone, rel=1e-11)
         np.testing.assert_allclose(gradient, slope, rtol=1e-6, atol=1e-8 * np.abs(slope).max())
 
