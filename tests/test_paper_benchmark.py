@@ -1,6 +1,5 @@
 """The comparison with peers: its scores, what methods are given, its page."""
 
-import json
 import math
 from dataclasses import replace
 
@@ -89,8 +88,10 @@ def test_several_training_records(monkeypatch):
 def row(experiment, method, seed, rmse, **more):
     found = {"rmse": rmse, "mae": rmse / 2, "crps": rmse / 3, "coverage_95": 0.9}
     return {
-        "experiment": experiment, "method": method, "seed": seed, "seconds": 10.0, "steps": 5,
-        "step_seconds": 0.1, "memory_gb": 1.0, "note": "", "figures": {},
+        "experiment": experiment, "method": method, "seed": seed,
+        "date": "2026-01-02", "commit": "abc1234", "reference_seconds": 0.6,
+        "seconds": 10.0, "steps": 5, "step_seconds": 0.1, "memory_gb": 1.0, "note": "",
+        "figures": {},
         "scores": {"test": {**found, "log_density": 1.0}}, **more,
     }  # fmt: skip
 
@@ -110,14 +111,24 @@ def test_page(tmp_path):
         mean = test.outputs[:, 0]
         arrays = {"test/mean": mean, "test/low": mean - 1, "test/high": mean + 1}
         np.savez(folder / f"{one['seed']}.npz", **arrays)
-    text = page(rows, tmp_path)
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    text = page(rows, tmp_path, pictures)
     assert "| pyro_dynogp | 0.1 (0.08 to 0.2) |" in text
     assert "| dynoGP, published | 0.147 | 0.109 | 0.081 |" in text
     assert "RMSE: 0.1, target 0.085: not reached, 17.6% above." in text
     assert "CRPS: 0.03333, target 0.055: reached." in text
     assert "deep GP, seed 0: failed, out of memory" in text
     assert "dynoNet: time was up" in text
-    assert (tmp_path / "drives_2" / "figure.png").stat().st_size > 10_000
+    assert "Run on 2026-01-02, commit abc1234, ten million additions took 0.6" in text
+    assert text.endswith("![coupled drives, second record](pictures/drives_2.png)")
+    picture = pictures / "drives_2.png"
+    assert picture.stat().st_size > 10_000
+    # Where predictions are gone, the picture stays as it is.
+    (tmp_path / "drives_2" / "dynoNet" / "0.npz").unlink()
+    before = picture.stat().st_mtime_ns
+    assert page(rows, tmp_path, pictures) == text
+    assert picture.stat().st_mtime_ns == before
 
 
 def test_numbers():
@@ -137,13 +148,27 @@ def test_finished_jobs_are_not_run_again_and_failures_are_kept(tmp_path, monkeyp
         raise run.subprocess.TimeoutExpired(command, options["timeout"])
 
     monkeypatch.setattr(run.subprocess, "run", process)
+    monkeypatch.setattr(run, "KEPT", tmp_path / "rows.jsonl")
     text = run.run(tmp_path, ["electricity"], ["dynoNet"])
     assert calls == [["electricity", "dynoNet", "0"]]
     assert "failed, stopped after" in text
     run.run(tmp_path, ["electricity"], ["dynoNet"])
     assert len(calls) == 1
-    file = run.file_of(tmp_path / "paper", ("electricity", "dynoNet", 0))
-    assert "failed" in json.loads(file.read_text())
+    ((job, row),) = run.read_rows(run.KEPT).items()
+    assert job == ("electricity", "dynoNet", 0)
+    assert row["failed"] == "stopped after 3000 s"
+
+
+def test_rows_that_are_kept(tmp_path):
+    path = tmp_path / "new" / "rows.jsonl"
+    assert run.read_rows(path) == {}
+    late, early = row("drives_2", "dynoNet", 1, 0.11), row("drives_1", "dynoNet", 0, 0.123456789)
+    for one in (late, early, {**late, "seconds": 20.0}):
+        run.keep(path, one)
+    found = run.read_rows(path)
+    assert list(found) == [("drives_1", "dynoNet", 0), ("drives_2", "dynoNet", 1)]
+    assert found["drives_1", "dynoNet", 0]["scores"]["test"]["rmse"] == 0.123457
+    assert found["drives_2", "dynoNet", 1]["seconds"] == 20.0
 
 
 def test_jobs_cover_everything_but_what_is_left_out():

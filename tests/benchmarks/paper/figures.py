@@ -20,12 +20,17 @@ SMOOTHED = 25
 COLOURS = ("#1b6ca8", "#d1495b", "#3a7d44", "#8a5a9e", "#b08900", "#5c5c5c", "#2a9d8f")
 
 
+def predictions_file(folder: Path, row: Row) -> Path:
+    """Where a job of the experiment has left what it predicted."""
+    return folder / folder_name(row["method"]) / f"{row['seed']}.npz"
+
+
 def _arrays(folder: Path, row: Row) -> Mapping[str, np.ndarray]:
-    with np.load(folder / folder_name(row["method"]) / f"{row['seed']}.npz") as file:
+    with np.load(predictions_file(folder, row)) as file:
         return {key: file[key] for key in file.files}
 
 
-def experiment_figure(experiment: Experiment, rows: Sequence[Row], folder: Path) -> None:
+def experiment_figure(experiment: Experiment, rows: Sequence[Row], folder: Path, to: Path) -> None:
     """The first test record with our band and the means of the peers; RMSE of all methods."""
     tests = experiment.load(experiment.seeds[0])[1]
     name, record = next(iter(tests.items()))
@@ -61,10 +66,10 @@ def experiment_figure(experiment: Experiment, rows: Sequence[Row], folder: Path)
     below.set_xlabel(f"RMSE [{experiment.unit}]")
     below.grid(axis="x", which="both", alpha=0.3)
     below.invert_yaxis()
-    figure.savefig(folder / "figure.png", dpi=110)
+    figure.savefig(to, dpi=110)
 
 
-def study_figure(experiment: Experiment, rows: Sequence[Row], folder: Path) -> None:
+def study_figure(experiment: Experiment, rows: Sequence[Row], folder: Path, to: Path) -> None:
     """Absolute error and CRPS along the test, medians over systems in units of the noise floor."""
     figure = Figure(figsize=(10.0, 6.4), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
@@ -92,7 +97,7 @@ def study_figure(experiment: Experiment, rows: Sequence[Row], folder: Path) -> N
         panel.legend(fontsize=8)
         panel.grid(alpha=0.3)
         panel.set_yscale("log")
-    figure.savefig(folder / "figure.png", dpi=110)
+    figure.savefig(to, dpi=110)
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:

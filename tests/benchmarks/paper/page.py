@@ -13,7 +13,7 @@ import pyro_dynogp as dgp
 from tests.benchmarks.markdown import table
 from tests.benchmarks.paper.bound import System, clean_error_bound
 from tests.benchmarks.paper.experiments import EXPERIMENTS, Experiment
-from tests.benchmarks.paper.figures import experiment_figure, study_figure
+from tests.benchmarks.paper.figures import experiment_figure, predictions_file, study_figure
 from tests.benchmarks.paper.prediction import OURS
 
 Row = Mapping[str, Any]
@@ -27,8 +27,13 @@ STUDY_COLUMNS = {"RMSE / floor": "rmse_over_floor", "clean RMSE / floor": "clean
 PUBLISHED = ("dynoGP, published", "dynoNet, published", "GP-NARX, published")
 
 
-def page(rows: Sequence[Row], folder: Path) -> str:
-    """One section for each experiment that has rows; figures are written to the folder."""
+def page(rows: Sequence[Row], folder: Path, pictures: Path) -> str:
+    """One section for each experiment that has rows.
+
+    Args:
+        rows: of finished jobs. folder: of what they predicted. pictures: folder for figures; that
+            of an experiment is drawn again where the predictions of all of its jobs are there.
+    """
     parts = [
         "Peers may learn for an experiment's budget of wall time, and stop before where they gain "
         "no more; pyro_dynogp runs with its default settings, whatever time they take. Some "
@@ -40,11 +45,11 @@ def page(rows: Sequence[Row], folder: Path) -> str:
     for key, experiment in EXPERIMENTS.items():
         own = [row for row in rows if row["experiment"] == key]
         if own:
-            parts += _section(key, experiment, own, folder)
+            parts += _section(experiment, own, folder / key, pictures / f"{key}.png")
     return "\n\n".join(parts)
 
 
-def _section(key: str, experiment: Experiment, rows: Sequence[Row], folder: Path) -> list[str]:
+def _section(experiment: Experiment, rows: Sequence[Row], folder: Path, picture: Path) -> list[str]:
     unit = f" Unit: {experiment.unit}." if experiment.unit else ""
     parts = [
         f"### {experiment.name}",
@@ -57,15 +62,16 @@ def _section(key: str, experiment: Experiment, rows: Sequence[Row], folder: Path
         if len(names) > 1:
             parts.append(f"Test record: {name}.")
         parts.append(_table(experiment, done, name, published=name == names[0]))
-    parts.append(_costs(done))
+    parts += [_costs(done), _machines(done)]
     parts += _targets(experiment, done)
     if experiment.system is not None:
         parts += _against_peers(done, experiment.system)
     parts += _notes(rows)
-    if done:
+    if done and all(predictions_file(folder, row).exists() for row in done):
         draw = study_figure if experiment.simulated else experiment_figure
-        draw(experiment, done, folder / key)
-        parts.append(f"![{experiment.name}](paper/{key}/figure.png)")
+        draw(experiment, done, folder, picture)
+    if picture.exists():
+        parts.append(f"![{experiment.name}]({picture.parent.name}/{picture.name})")
     return parts
 
 
@@ -125,6 +131,19 @@ def _costs(rows: Sequence[Row]) -> str:
             spread(np.array([row["memory_gb"] for row in own])),
         ])  # fmt: skip
     return table(lines[0], lines[1:])
+
+
+def _machines(rows: Sequence[Row]) -> str:
+    """When and with which commit jobs ran, and how fast the machine was."""
+    runs: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        runs.setdefault((row["date"], row["commit"]), []).append(row)
+    found = []
+    for (date, commit), own in sorted(runs.items()):
+        methods = ", ".join(_methods(own)) if len(runs) > 1 else "all"
+        seconds = spread(np.array([row["reference_seconds"] for row in own]))
+        found.append(f"{date}, commit {commit}, ten million additions took {seconds} s ({methods})")
+    return f"Run on {'; '.join(found)}."
 
 
 LENGTHS: dict[str, int] = {}

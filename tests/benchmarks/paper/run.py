@@ -1,4 +1,8 @@
-"""Run all methods on all experiments, what is missing of it, and write the page."""
+"""Run all methods on all experiments, what is missing of it, and write the page.
+
+What finished jobs found is kept with the project, so that a study of many hours can be made in
+parts; every row says on which day, with which commit, and on how fast a machine.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +22,10 @@ from tests.benchmarks.paper.ours import STACK
 from tests.benchmarks.paper.page import page
 from tests.benchmarks.paper.prediction import OURS, folder_name
 
+# Rows of finished jobs, a line each, beside the page that they make; a job whose line is deleted is
+# run again.
+PICTURES = Path("docs/paper")
+KEPT = PICTURES / "rows.jsonl"
 # A method is given this many times its budget before it is stopped; it should stop by itself.
 GRACE = 4.0
 
@@ -53,19 +61,34 @@ def run(
     """Do what is missing, one job at a time on the whole machine; tables and figures of all.
 
     Args:
-        folder: finished jobs are files in ``paper/``; delete those that should be run again.
+        folder: for what is predicted and drawn, in ``paper/``.
         experiments, methods: names, all by default.
     """
     base = folder / "paper"
-    wanted = jobs(experiments, methods)
-    missing = [job for job in wanted if not file_of(base, job).exists()]
+    rows = read_rows(KEPT)
+    missing = [job for job in jobs(experiments, methods) if job not in rows]
     bar = tqdm(missing, desc="paper", disable=not missing)
     for job in bar:
         bar.set_postfix_str(f"{job[1]}, {job[0]}, seed {job[2]}")
         _one(base, job)
-    rows = [json.loads(file_of(base, job).read_text()) for job in jobs()
-            if file_of(base, job).exists()]  # fmt: skip
-    return page(rows, base)
+        keep(KEPT, json.loads(file_of(base, job).read_text()))
+    return page(list(read_rows(KEPT).values()), base, PICTURES)
+
+
+def read_rows(path: Path) -> dict[tuple[str, str, int], dict[str, Any]]:
+    """What finished jobs have found, in the order of `jobs`; the last line of each counts."""
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    rows = {(r["experiment"], r["method"], r["seed"]): r for r in map(json.loads, lines)}
+    order = {job: place for place, job in enumerate(jobs())}
+    return dict(sorted(rows.items(), key=lambda one: order.get(one[0], len(order))))
+
+
+def keep(path: Path, row: dict[str, Any]) -> None:
+    """Add the row of a job, figures to six digits; one write, safe beside other processes."""
+    short = json.loads(json.dumps(row), parse_float=lambda text: float(f"{float(text):.6g}"))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(short) + "\n")
 
 
 def file_of(base: Path, job: tuple[str, str, int]) -> Path:
