@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,6 +13,10 @@ import pandas as pd
 from scipy.special import logsumexp, ndtr, ndtri
 
 from pyro_dynogp._errors import invalid
+
+# A quantile is found to this share of the smallest standard deviation of a component; steps for it.
+RESOLUTION, ITERATIONS = 1e-10, 100
+ROOT_TWO_PI = math.sqrt(2.0 * math.pi)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,11 +118,23 @@ class Prediction:
         low, high = ends.min(0), ends.max(0)  # the quantile of a mixture lies between these
         if mean.shape[0] == 1:
             return low
-        for _ in range(60):
-            middle = 0.5 * (low + high)
-            below = self._average(ndtr((middle - mean) / sd)) < level
-            low, high = np.where(below, middle, low), np.where(below, high, middle)
-        return 0.5 * (low + high)
+        found, last = self._average(ends), high - low
+        for _ in range(ITERATIONS):
+            z = (found - mean) / sd
+            excess = self._average(ndtr(z)) - level
+            low, high = np.where(excess < 0, found, low), np.where(excess < 0, high, found)
+            density = self._average(np.exp(-0.5 * z**2) / (ROOT_TWO_PI * sd))
+            # Newton's step, or to the middle of what is left where that leads out of it or is slow.
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+                step = -excess / density
+            settled = np.minimum(np.abs(step), high - low) <= RESOLUTION * sd.min(0)
+            if settled.all():
+                break
+            newton = (found + step > low) & (found + step < high) & (np.abs(step) < 0.5 * last)
+            step = np.where(newton, step, 0.5 * (low + high) - found)
+            step[settled] = 0.0
+            found, last = found + step, np.abs(step)
+        return found
 
     def log_density(self, outputs: np.ndarray) -> np.ndarray:
         """Log-density (n, n_y) of each measured output by itself; NaN where it is missing."""

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from pyro_dynogp._errors import invalid
+from pyro_dynogp.prediction.mixture_score import mixture_crps
 from pyro_dynogp.prediction.prediction import Prediction
 from pyro_dynogp.record import Record
 
@@ -26,7 +27,7 @@ def scores(prediction: Prediction, record: Record, skip: int = 0) -> dict[str, A
         - ``nrmse``: rmse over the standard deviation of the measured output.
         - ``fit_percent``: 100 (1 - nrmse), the fit index of system identification [%].
         - ``crps`` [output]: continuous ranked probability score, exact for the normal mixture
-          (Gneiting & Raftery 2007; computed by scoringrules).
+          (`pyro_dynogp.prediction.mixture_score`).
         - ``negative_log_density`` [nats per sample]: of each sample by itself.
         - ``coverage_50``, ``coverage_95``: share of samples within the central intervals.
         - ``count``: number of samples scored.
@@ -67,12 +68,18 @@ def scores(prediction: Prediction, record: Record, skip: int = 0) -> dict[str, A
         spread = float(target.std())
         rmse = float(np.sqrt(np.mean(error**2)))
         nrmse = rmse / spread if spread > 0 else float("nan")
+        crps = mixture_crps(
+            target,
+            prediction.component_mean[:, there, a],
+            prediction.component_sd[:, there, a],
+            prediction.component_weights,
+        )
         values = {
             "rmse": rmse,
             "mae": float(np.mean(np.abs(error))),
             "nrmse": nrmse,
             "fit_percent": 100.0 * (1.0 - nrmse),
-            "crps": _crps(prediction, there, a, target),
+            "crps": float(crps.mean()),
             "negative_log_density": -float(np.mean(density[there, a])),
             "coverage_50": _inside(target, low50[there, a], high50[there, a]),
             "coverage_95": _inside(target, low95[there, a], high95[there, a]),
@@ -87,25 +94,3 @@ def scores(prediction: Prediction, record: Record, skip: int = 0) -> dict[str, A
 
 def _inside(y: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
     return float(np.mean((y >= low) & (y <= high)))
-
-
-def _crps(prediction: Prediction, there: np.ndarray, a: int, y: np.ndarray) -> float:
-    import scoringrules  # its import compiles code, which takes seconds
-
-    mean = prediction.component_mean[:, there, a]
-    sd = prediction.component_sd[:, there, a]
-    if len(mean) == 1:
-        return float(np.mean(scoringrules.crps_normal(y, mean[0], sd[0])))
-    # The mixture's score is quadratic in the number of draws: blocks bound the memory.
-    block = max(1, int(2e7 / len(mean) ** 2))
-    weights = prediction.weights
-    parts = [
-        scoringrules.crps_mixnorm(
-            y[k],
-            mean[:, k].T,
-            sd[:, k].T,
-            None if weights is None else np.broadcast_to(weights, mean[:, k].T.shape),
-        )
-        for k in (slice(i, i + block) for i in range(0, len(y), block))
-    ]
-    return float(np.mean(np.concatenate([np.atleast_1d(part) for part in parts])))

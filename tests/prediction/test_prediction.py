@@ -1,10 +1,16 @@
 """Mixture moments, quantiles and densities; scores."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from scipy import stats
+import scoringrules
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import optimize, stats
 
 import pyro_dynogp as dgp
+from pyro_dynogp.prediction.mixture_score import mixture_crps
 from pyro_dynogp.prediction.prediction import Prediction
 
 
@@ -88,6 +94,44 @@ def test_crps_is_the_integral_of_the_squared_error_of_the_distribution(draws):
     step = (grid[:, None] >= record.outputs[:, 0]).astype(float)
     crps = np.trapezoid((F - step) ** 2, grid, axis=0)
     assert dgp.scores(p, record)["crps"] == pytest.approx(crps.mean(), rel=1e-3)
+
+
+@given(
+    draws=st.integers(1, 12),
+    spread=st.floats(0.0, 30.0),
+    ratio=st.floats(1.0, 1000.0),
+    seed=st.integers(0, 2**31),
+)
+def test_crps_and_quantiles_of_any_mixture(draws, spread, ratio, seed):
+    """Beside scoringrules, and a root found by Brent's method in each distribution function."""
+    rng = np.random.default_rng(seed)
+    mean = spread * rng.standard_normal((draws, 5))
+    sd = ratio ** rng.uniform(-0.5, 0.5, (draws, 5))
+    weight = rng.dirichlet(np.ones(draws))
+    y = spread * rng.standard_normal(5)
+    expected = scoringrules.crps_mixnorm(y, mean.T, sd.T, np.broadcast_to(weight, (5, draws)))
+    found = mixture_crps(y, mean, sd, weight)
+    # The closed form subtracts numbers as large as the spread and the widest component.
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12 * (spread + ratio))
+
+    p = replace(
+        mixture(draws=draws, n=5, n_y=1, seed=0), component_mean=mean[..., None],
+        component_variance=sd[..., None] ** 2, noise_variance=np.zeros((draws, 1)), weights=weight,
+    )  # fmt: skip
+    for level, ours in zip((0.001, 0.5, 0.95), p.quantile([0.001, 0.5, 0.95]), strict=True):
+        for k in range(5):
+            ends = mean[:, k] + stats.norm.ppf(level) * sd[:, k]
+            arguments = (weight, mean[:, k], sd[:, k], level)
+            low, high = ends.min() - 1e-9, ends.max() + 1e-9
+            root = optimize.brentq(excess, low, high, args=arguments, xtol=1e-13)
+            # Where a gap between components leaves no density, many points have the level.
+            near = abs(ours[k, 0] - root) <= 1e-8 * (1.0 + abs(root))
+            assert near or abs(excess(ours[k, 0], *arguments)) < 1e-14
+
+
+def excess(x, weight, mean, sd, level):
+    """Distribution function of a mixture of normals over a level."""
+    return weight @ stats.norm.cdf(x, mean, sd) - level
 
 
 def test_coverage_of_a_true_prediction_is_nominal():
