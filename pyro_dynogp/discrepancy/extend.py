@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from pyro_dynogp.channels import Channel, count_direct
+from pyro_dynogp.inference.cascade_fit import deterministic
 from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.layers import Dynamic, Static
@@ -57,6 +58,13 @@ def with_process_noise(model: Model) -> Model:
         for layer in model.layers
     )
     return replace(model, layers=layers)
+
+
+def without_process_noise(model: Model) -> Model:
+    """The model with deterministic dynamics, but where process noise is all that drives them."""
+    if isinstance(model, LinearDynamicGP):
+        return replace(model, process_noise=False)
+    return deterministic(model)
 
 
 def has_process_noise(model: Model) -> bool:

@@ -16,7 +16,12 @@ from pyro_dynogp.discrepancy.blocks import Blocks, blocks_of, shared
 from pyro_dynogp.discrepancy.confirm import Confirmed, confirm
 from pyro_dynogp.discrepancy.effects import CATALOGUE, Effect
 from pyro_dynogp.discrepancy.evidence import Residuals
-from pyro_dynogp.discrepancy.extend import Model, has_function, used_channels
+from pyro_dynogp.discrepancy.extend import (
+    Model,
+    has_function,
+    used_channels,
+    without_process_noise,
+)
 from pyro_dynogp.discrepancy.gate import structure_left
 from pyro_dynogp.discrepancy.noise_effects import data_faults
 from pyro_dynogp.discrepancy.parameters import limits_of, parameters_of
@@ -32,7 +37,6 @@ from pyro_dynogp.discrepancy.trials import (
 from pyro_dynogp.inference.fit import fit as fit_model
 from pyro_dynogp.inference.result import Method
 from pyro_dynogp.models.cascade import Cascade
-from pyro_dynogp.models.linear import LinearDynamicGP
 from pyro_dynogp.parallel import parallel_map
 from pyro_dynogp.prediction.clock import joined
 from pyro_dynogp.prediction.scores import scores
@@ -44,7 +48,7 @@ if TYPE_CHECKING:
 # Families of effects that go with inputs.
 OF_INPUTS = ("paths", "shapes")
 # Fresh starts of the last fits, of linear models and of cascades.
-LINEAR_STARTS, CASCADE_STARTS = 2, 4
+LINEAR_STARTS, CASCADE_STARTS = 2, 1
 SCORES = ("rmse", "mae", "nrmse", "crps", "coverage_50", "coverage_95")
 
 
@@ -97,7 +101,9 @@ def close_loop(
     names = _names(fit, data.known, candidates)
     poles = poles_of(fit)
     training = without(data.known, data.held_out)
-    first = quick_fit(fit.model, training, poles, seed) if data.refit else fit.at_mode()
+    first = fit.at_mode()
+    if data.refit or isinstance(fit.model, Cascade):  # as far up as its extensions will get
+        first = quick_fit(fit.model, training, poles, seed, None if data.refit else first)
     current = first
     clock.next("fit of block A")
     state = _State(data, names, seed, level, tries, effects, workers, progress)
@@ -201,10 +207,10 @@ class _State:
             "seed": self.seed, "workers": self.workers, "progress": self.progress,
         }  # fmt: skip
         found, skipped = look(residuals, effects, **options)
-        if isinstance(fit.model, LinearDynamicGP) and fit.model.process_noise:
+        plain = without_process_noise(fit.model)
+        if plain != fit.model:
             structural = [e for e in effects if e.family in OF_INPUTS and e.score == "forecast"]
             training = without(self.data.known, self.held_out)
-            plain = replace(fit.model, process_noise=False)
             again = quick_fit(plain, training, poles_of(fit), self.seed, fit)
             others = self.residuals(again, self.data.known, self.held_out)
             found = merged(found, look(others, structural, **options)[0])

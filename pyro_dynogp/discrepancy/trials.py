@@ -12,7 +12,7 @@ from scipy.special import logsumexp
 
 from pyro_dynogp.criticism.densities import pointwise_log_density
 from pyro_dynogp.discrepancy.extend import Model, has_function
-from pyro_dynogp.inference.cascade_fit import climb, starting_points
+from pyro_dynogp.inference.cascade_fit import climb, grow, starting_points
 from pyro_dynogp.inference.checkpoints import NOTHING_KEPT
 from pyro_dynogp.inference.fit import at_optimum
 from pyro_dynogp.inference.maximum import Optimum, maximise
@@ -34,6 +34,8 @@ from pyro_dynogp.record import Record
 # cascades.
 LINEAR_STEPS, LINEAR_STARTS = 120, 2
 CASCADE_STEPS, CASCADE_STARTS = 300, 4
+# Iterations from what the base of a cascade has learnt.
+WARM_STEPS = 100
 # Blocks of a record on which effects of one instant are scored, every other one at a time.
 BLOCKS = 12
 Score = Literal["one step", "forecast"]
@@ -208,27 +210,24 @@ def _linear(
 def _cascade(
     model: Cascade, records: Sequence[Record], seed: int, base: Fit | None, short: bool
 ) -> list[Optimum]:
-    """Fresh starts; from the base instead, and one fresh one, where it has the same layers.
+    """From what the base has learnt, where it has the same layers; else from fresh starts.
 
     Without a function a cascade starts at its optimum but for the noise: one start is enough.
     """
-    count, steps = CASCADE_STARTS if has_function(model) else 1, CASCADE_STEPS
-    target = model.collapsed
+    target, record = model.collapsed, records[0]
     before = None if base is None else base.model
-    warm = isinstance(before, Cascade) and len(before.layers) == len(model.layers)
-    linear = (5 if short else LINEAR_STEPS // 3) if warm else LINEAR_STEPS
-    starts = starting_points(
-        target, records, 1 if warm else count, linear, seed, 1, False, NOTHING_KEPT
-    )
-    learnt = []
-    if warm:
-        assert base is not None
-        learnt = [grown(base.mode, starts[0])]
-        starts, steps = ([], steps // 5) if short else (starts, steps // 2)
-    return climb(
-        target, records[0], starts, learnt, optimizer="adam", steps=steps, seed=seed, workers=1,
-        together=TOGETHER,
-    )  # fmt: skip
+    if base is None or not isinstance(before, Cascade) or len(before.layers) != len(model.layers):
+        count = CASCADE_STARTS if has_function(model) else 1
+        starts = starting_points(target, records, count, LINEAR_STEPS, seed, 1, False, NOTHING_KEPT)
+        return climb(
+            target, record, starts, [], optimizer="adam", steps=CASCADE_STEPS, seed=seed,
+            workers=1, together=TOGETHER,
+        )  # fmt: skip
+    linear = 5 if short else LINEAR_STEPS // 3
+    (start,) = starting_points(target, records, 1, linear, seed, 1, False, NOTHING_KEPT)
+    learnt = grown(base.mode, start, silent=True)
+    steps = WARM_STEPS // 3 if short else WARM_STEPS
+    return grow(target, record, learnt, start, steps=steps, seed=seed)
 
 
 def poles_of(fit: Fit) -> np.ndarray | None:

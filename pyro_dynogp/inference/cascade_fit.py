@@ -72,6 +72,17 @@ def starting_points(
         ]
 
 
+def deterministic(model: Cascade) -> Cascade:
+    """The model without process noise, but in layers that nothing else drives."""
+    layers = tuple(
+        replace(layer, process_noise=False, name=one.name)
+        if isinstance(layer, Dynamic) and layer.process_noise and one.channels
+        else layer
+        for one, layer in zip(model.wires, model.layers, strict=True)
+    )
+    return replace(model, layers=layers)
+
+
 def without_process_noise(model: Cascade) -> Cascade:
     """The model with deterministic dynamics; the same one where no static layer sees noise.
 
@@ -80,15 +91,7 @@ def without_process_noise(model: Cascade) -> Cascade:
     static = [place for place, one in enumerate(model.layers) if isinstance(one, Static)]
     last = static[-1] if static else 0
     seen = any(isinstance(one, Dynamic) and one.process_noise for one in model.layers[:last])
-    if not seen:
-        return model
-    layers = tuple(
-        replace(layer, process_noise=False, name=one.name)
-        if isinstance(layer, Dynamic) and one.channels
-        else layer
-        for one, layer in zip(model.wires, model.layers, strict=True)
-    )
-    return replace(model, layers=layers)
+    return deterministic(model) if seen else model
 
 
 def _louder(values: Values) -> Values:
@@ -163,3 +166,21 @@ def climb(
         better = found[: (len(starts) + 1) // 2]
         starts = [grown(one.values, starts[0]) for one in better]
     return maximise(model, records, [*learnt, *starts], steps=steps, key="cascade", **options)
+
+
+def grow(
+    model: Cascade, record: Record, learnt: Values, start: Values, *, steps: int, seed: int
+) -> list[Optimum]:
+    """Optima of the collapsed model near what a smaller model, or the same one, has learnt.
+
+    Process noise that has explained what the smaller model lacks keeps the larger one from
+    explaining it: one climb goes without any first, and takes that of `start` then.
+    """
+    options: dict[str, Any] = {"steps": steps, "seed": seed, "workers": 1}
+    starts = [learnt]
+    quiet = without_process_noise(model)
+    if quiet != model:
+        (found, *_) = maximise(quiet, record, [_louder(learnt)], key="grown-quiet", **options)
+        starts.append(grown(found.values, start))
+    optima = [maximise(model, record, [one], key="grown", **options)[0] for one in starts]
+    return sorted(optima, key=lambda one: one.energy)

@@ -18,6 +18,11 @@ from pyro_dynogp.models.priors import HORSESHOE_SCALE, TimeScale, numerators
 from pyro_dynogp.record import Record
 from pyro_dynogp.scaling import Scaling
 
+# What is left of new rows of a site, by the end of its name, where they shall do nothing yet. Not
+# nothing of process noise: of a gain that is zero the density has no slope.
+SILENT = {"input_gain": 0.0, "feedthrough": 0.0, "direct": 0.0, "initial_state": 0.0,
+          "noise_gain_unit": 0.05}  # fmt: skip
+
 
 def starting_values(
     model: LinearDynamicGP, records: Sequence[Record], *, count: int, seed: int, tries: int = 48
@@ -44,16 +49,21 @@ def starting_values(
     return [values for _, values in candidates[:count]]
 
 
-def grown(values: Mapping[str, Tensor], start: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def grown(
+    values: Mapping[str, Tensor], start: Mapping[str, Tensor], *, silent: bool = False
+) -> dict[str, Tensor]:
     """A start with what another fit has learnt: values of a smaller model, or of the same one.
 
     Sites of one name and as many dimensions share their first rows and columns; the rest of the
-    start (new inputs, pairs, layers) stays as it is.
+    start (new inputs, pairs, layers) stays as it is. With `silent` the rest of a shared site does
+    nothing yet, so that the start explains nearly as much as what it has grown from.
     """
     out = {}
     for name, value in start.items():
         new = value.clone()
         if name in values and values[name].dim() == new.dim():
+            if silent:
+                new *= next((x for end, x in SILENT.items() if name.endswith(end)), 1.0)
             common = tuple(
                 slice(min(a, b)) for a, b in zip(new.shape, values[name].shape, strict=True)
             )

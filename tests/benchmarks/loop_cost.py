@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from scipy.signal import lfilter
 
 import pyro_dynogp as dgp
 from tests.benchmarks.markdown import table
-from tests.benchmarks.planted import base_model, cases_of
+from tests.benchmarks.planted import base_model
 from tests.discrepancy.plants import Plant, plant
 
 SAMPLES, CANDIDATES = 2000, 5
@@ -20,8 +21,8 @@ EFFECT = "extra input"
 
 def made(kind: str) -> Plant:
     """A plant of which one candidate acts strongly; the others are decoys."""
-    (case,) = cases_of(1, [EFFECT], strengths=("strong",), kind=kind)
-    found = plant(EFFECT, "strong", case.replicate, samples=SAMPLES)
+    plants = (plant(EFFECT, "strong", number, samples=SAMPLES) for number in itertools.count())
+    found = next(one for one in plants if one.base["kind"] == kind)
     rng = np.random.default_rng(0)
     more = CANDIDATES - len(found.record.extra)
     decoys = {

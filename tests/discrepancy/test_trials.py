@@ -1,0 +1,121 @@
+"""Refits of extended models: what they start from, and how far they get."""
+
+from dataclasses import replace
+
+import numpy as np
+import pyro
+import pytest
+import torch
+
+import pyro_dynogp as dgp
+from pyro_dynogp.channels import Recorded
+from pyro_dynogp.discrepancy.extend import with_channel, with_pairs, without_process_noise
+from pyro_dynogp.discrepancy.trials import held_out_density, quick_fit
+from pyro_dynogp.inference import cascade_fit
+from pyro_dynogp.inference.cascade_fit import grow, starting_points
+from pyro_dynogp.inference.checkpoints import NOTHING_KEPT
+from pyro_dynogp.inference.maximum import maximise
+from pyro_dynogp.inference.starts import grown
+from tests.discrepancy.made import coloured
+from tests.discrepancy.plant_dynamics import System, response
+
+NOISE, N, TRAINING = 0.05, 320, 220
+
+
+@pytest.fixture(scope="module")
+def record():
+    """A sensor curve behind the responses to u and to "w"; nothing else acts."""
+    rng = np.random.default_rng(3)
+    u, w = coloured(rng, N, 0.9), coloured(rng, N, 0.9)
+    system = System(np.array([-0.15 + 0.25j]), np.array([[0.2 - 0.3j, -0.1 - 0.2j]]))
+    g = response(system, np.column_stack([u, w]))
+    g /= g.std()
+    y = np.tanh(g) + 0.3 * np.tanh(g) ** 2 + NOISE * rng.standard_normal(N)
+    return dgp.Record(
+        time=0.1 * np.arange(N), inputs=u[:, None], outputs=y[:, None], extra={"w": w}
+    )
+
+
+@pytest.fixture(scope="module")
+def base(record):
+    model = dgp.Wiener(1, pairs=1, inducing=6)
+    training = record[:TRAINING]
+    fit = dgp.fit(model, training, method="map", restarts=2, steps=100, workers=1, progress=False)
+    return quick_fit(model, training, None, 0, fit)
+
+
+def log_likelihood(model, records, values):
+    trace = pyro.poutine.trace(pyro.poutine.condition(model, data=values)).get_trace(*records)
+    trace.compute_log_prob()
+    return float(trace.nodes["y"]["log_prob_sum"])
+
+
+@pytest.mark.parametrize("more", ["channel", "pair"])
+def test_what_has_grown_starts_at_the_likelihood_of_its_base(record, base, more):
+    plain = replace(base.model, scaling=None)
+    extended = with_channel(plain, Recorded("w")) if more == "channel" else with_pairs(plain, 1)
+    records = extended.check(record[:TRAINING])
+    target = extended.scaled_to(records).collapsed
+    (start,) = starting_points(target, records, 1, 5, 0, 1, False, NOTHING_KEPT)
+    before = log_likelihood(base.model.collapsed, base.model.check(record[:TRAINING]), base.mode)
+    after = log_likelihood(target, records, grown(base.mode, start, silent=True))
+    loud = log_likelihood(target, records, grown(base.mode, start))
+    # A new pair has a little process noise already.
+    assert after == pytest.approx(before, rel=1e-9 if more == "channel" else 1e-2)
+    assert abs(loud - before) > 10.0 * max(abs(after - before), 1.0)
+
+
+def test_an_extended_cascade_explains_what_its_base_lacks(record, base):
+    training, fold = record[:TRAINING], np.arange(N) >= TRAINING
+    model = with_channel(replace(base.model, scaling=None), Recorded("w"))
+    fit = quick_fit(model, training, None, 0, base)
+    assert float(fit.start_energies[0]) < float(base.start_energies[0]) - 100.0
+    gain = held_out_density(fit, record, fold, "forecast")
+    gain = gain - held_out_density(base, record, fold, "forecast")
+    assert gain.sum() > 100.0
+    error = fit.forecast(training, record[TRAINING:]).mean - record.outputs[TRAINING:]
+    # 100 samples; the bend and both responses are known to some 10 % of the noise each.
+    assert np.sqrt(np.mean(error**2)) < 1.3 * NOISE
+
+
+def test_the_same_model_goes_on_from_where_it_is(record, base):
+    again = quick_fit(base.model, record[:TRAINING], None, 0, base)
+    assert float(again.start_energies[0]) <= float(base.start_energies[0]) + 1e-6
+
+
+def test_growing_climbs_without_process_noise_too(monkeypatch, record, base):
+    calls = []
+
+    def recorded(model, records, starts, **options):
+        found = maximise(model, records, starts, **options)
+        calls.append((model, starts[0], found[0]))
+        return found
+
+    monkeypatch.setattr(cascade_fit, "maximise", recorded)
+    records = base.model.check(record[:TRAINING])
+    target = base.model.collapsed
+    (start,) = starting_points(target, records, 1, 5, 0, 1, False, NOTHING_KEPT)
+    calls.clear()
+    found = grow(target, records[0], base.mode, start, steps=5, seed=0)
+    (quiet, loud, without), (_, first, one), (_, second, other) = calls
+    assert not quiet.layers[0].process_noise
+    assert float(loud["noise_sd"]) >= 0.5
+    torch.testing.assert_close(first["f_values"], base.mode["f_values"])
+    torch.testing.assert_close(second["f_values"], without.values["f_values"])
+    torch.testing.assert_close(second["g_noise_gain_unit"], start["g_noise_gain_unit"])
+    assert [x.energy for x in found] == sorted([one.energy, other.energy])
+    # Where there is no such noise one climb is enough.
+    calls.clear()
+    silent = without_process_noise(base.model).collapsed
+    grow(silent, records[0], base.mode, start, steps=2, seed=0)
+    assert len(calls) == 1
+
+
+def test_models_without_process_noise_stay_as_they_are():
+    for model in (
+        dgp.Wiener(1, process_noise=False),
+        dgp.LinearDynamicGP(1, process_noise=False),
+        dgp.Cascade(1, (dgp.Dynamic(pairs=1, process_noise=False),)),
+    ):
+        assert without_process_noise(model) == model
+    assert not without_process_noise(dgp.LinearDynamicGP(1)).process_noise
