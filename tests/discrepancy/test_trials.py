@@ -9,6 +9,8 @@ import torch
 
 import pyro_dynogp as dgp
 from pyro_dynogp.channels import Recorded
+from pyro_dynogp.criticism.comparison import block_standard_error
+from pyro_dynogp.discrepancy.confirm import ERRORS, NATS
 from pyro_dynogp.discrepancy.extend import with_channel, with_pairs, without_process_noise
 from pyro_dynogp.discrepancy.trials import held_out_density, quick_fit
 from pyro_dynogp.inference import cascade_fit
@@ -40,7 +42,7 @@ def record():
 def base(record):
     model = dgp.Wiener(1, pairs=1, inducing=6)
     training = record[:TRAINING]
-    fit = dgp.fit(model, training, method="map", restarts=2, steps=100, workers=1, progress=False)
+    fit = dgp.fit(model, training, method="map", restarts=1, steps=60, workers=1, progress=False)
     return quick_fit(model, training, None, 0, fit)
 
 
@@ -62,17 +64,18 @@ def test_what_has_grown_starts_at_the_likelihood_of_its_base(record, base, more)
     loud = log_likelihood(target, records, grown(base.mode, start))
     # A new pair has a little process noise already.
     assert after == pytest.approx(before, rel=1e-9 if more == "channel" else 1e-2)
-    assert abs(loud - before) > 10.0 * max(abs(after - before), 1.0)
+    assert abs(loud - before) > 4.0 * max(abs(after - before), 1.0)
 
 
 def test_an_extended_cascade_explains_what_its_base_lacks(record, base):
     training, fold = record[:TRAINING], np.arange(N) >= TRAINING
     model = with_channel(replace(base.model, scaling=None), Recorded("w"))
     fit = quick_fit(model, training, None, 0, base)
-    assert float(fit.start_energies[0]) < float(base.start_energies[0]) - 100.0
+    assert float(fit.start_energies[0]) < float(base.start_energies[0]) - 50.0
     gain = held_out_density(fit, record, fold, "forecast")
     gain = gain - held_out_density(base, record, fold, "forecast")
-    assert gain.sum() > 100.0
+    # What the loop asks of an effect, and more.
+    assert gain.sum() > max(5.0 * NATS, 2.0 * ERRORS * block_standard_error(gain)[0])
     error = fit.forecast(training, record[TRAINING:]).mean - record.outputs[TRAINING:]
     # 100 samples; the bend and both responses are known to some 10 % of the noise each.
     assert np.sqrt(np.mean(error**2)) < 1.3 * NOISE
