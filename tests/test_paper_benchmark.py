@@ -120,7 +120,10 @@ def test_page(tmp_path):
     assert "CRPS: 0.03333, target 0.055: reached." in text
     assert "deep GP, seed 0: failed, out of memory" in text
     assert "dynoNet: time was up" in text
-    assert "Run on 2026-01-02, commit abc1234, ten million additions took 0.6" in text
+    assert (
+        "Runs: 4 on 2026-01-02 with commit abc1234 (ten million additions took 0.6 to 0.6 s)."
+        in text
+    )
     assert text.endswith("![coupled drives, second record](pictures/drives_2.png)")
     picture = pictures / "drives_2.png"
     assert picture.stat().st_size > 10_000

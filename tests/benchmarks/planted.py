@@ -2,7 +2,8 @@
 
 A plant of `tests.discrepancy.plants` is made, a model that lacks the effect is fitted to the first
 half of its record, and the loop is closed on the whole of it; the search sees the record only.
-Every case is a line of a file, so that an interrupted study goes on where it was.
+Every case is a line of a file that is kept with the project, so that a study of many hours can be
+made in parts; a line says with which commit.
 """
 
 from __future__ import annotations
@@ -20,11 +21,13 @@ import numpy as np
 
 import pyro_dynogp as dgp
 from pyro_dynogp.parallel import parallel_map
+from tests.benchmarks.circumstances import here
 from tests.benchmarks.planted_table import NOTHING, confusion_picture, is_right, tables
 from tests.discrepancy.plants import EFFECTS, STRENGTHS, Plant, Strength, plant
 
 # One round: what is named first, and what adding it brings.
 SAMPLES, INDUCING, ROUNDS = 1200, 16, 1
+KEPT = Path("docs/planted")
 SCORES = ("rmse", "mae", "crps", "coverage_95")
 
 
@@ -155,7 +158,7 @@ def _append(path: Path, row: Mapping[str, Any]) -> None:
 def _work(task: tuple[Case, Path]) -> dict[str, Any]:
     case, path = task
     try:
-        row = study(case)
+        row = study(case) | here()
     except Exception as error:  # a case that fails is a result: it is counted, and tried again
         traceback.print_exc()
         row = {**asdict(case), "effect": case.effect or NOTHING}
@@ -178,19 +181,22 @@ def run(
     split: str = "development",
     strengths: Sequence[Strength] = STRENGTHS,
     kind: str | None = None,
+    kept: Path = KEPT,
 ) -> str:
     """Run what is missing of the study and tabulate all of it.
 
     Args:
-        folder: for `planted.<split>.jsonl` (a line for each case; delete it after a change of the
-            search or of the plants) and `confusion.png`.
+        folder: for `confusion.png`.
         replicates: plants of each effect and strength, and of each strength as many null plants.
         effects: names, None among them for null plants; by default all.
         workers: processes, None for all processors.
         split: "development", or "final" for the plants that nothing was tuned on.
         strengths: that are planted. kind: of the models to start from, "linear" or "wiener".
+        kept: folder of `planted.<split>.jsonl`, a line for each case; delete it after a change of
+            the search or of the plants.
     """
-    path = folder / f"planted.{split}.jsonl"
+    kept.mkdir(parents=True, exist_ok=True)
+    path = kept / f"planted.{split}.jsonl"
     wanted = cases_of(replicates, effects, split, strengths, kind)
     rows = {
         (r["effect"], r["strength"], r["replicate"], r["split"]): r

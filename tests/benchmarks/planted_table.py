@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy import stats
 
+from tests.benchmarks.circumstances import sentence
 from tests.benchmarks.markdown import table
 from tests.discrepancy.plants import CATALOGUE, OUTSIDE, STRENGTHS
 
@@ -92,7 +93,7 @@ def tables(rows: Sequence[Row]) -> str:
     """All tables as one Markdown text."""
     done = _done(rows)
     parts = [
-        f"{len(rows)} plants, {len(rows) - len(done)} of them failed.",
+        f"{len(rows)} plants, {len(rows) - len(done)} of them failed. {sentence(done)}",
         _null_sentences(done),
         "### Named first, by planted effect",
         _confusion_table(done),

@@ -173,20 +173,23 @@ def test_an_interrupted_study_goes_on(tmp_path, monkeypatch):
             raise RuntimeError("no luck")
         return row(case.effect or NOTHING, strength=case.strength, replicate=case.replicate)
 
+    circumstances = {"date": "2026-01-02", "commit": "abc1234", "reference_seconds": 0.6}
     monkeypatch.setattr(planted, "study", study)
-    text = planted.run(tmp_path, replicates=1, effects=["drift", None], workers=1)
+    monkeypatch.setattr(planted, "here", lambda: circumstances)
+    text = planted.run(tmp_path, replicates=1, effects=["drift", None], workers=1, kept=tmp_path)
     assert len(asked) == 6
     assert "RuntimeError: no luck" in text
+    assert "Runs: 5 on 2026-01-02 with commit abc1234" in text
     path = tmp_path / "planted.development.jsonl"
     with path.open("a") as file:  # a kill in the middle of a line
         file.write('{"effect": "drift", "strength"')
     assert len(read_rows(path)) == 6
     asked.clear()
-    planted.run(tmp_path, replicates=2, effects=["drift", None], workers=1)
+    planted.run(tmp_path, replicates=2, effects=["drift", None], workers=1, kept=tmp_path)
     assert ("drift", "weak", 0, "development") in asked  # what failed is tried again
     assert len(asked) == 1 + 6
     asked.clear()
-    planted.run(tmp_path, replicates=1, effects=["drift", None], workers=1)
+    planted.run(tmp_path, replicates=1, effects=["drift", None], workers=1, kept=tmp_path)
     assert asked == [("drift", "weak", 0, "development")]
 
 

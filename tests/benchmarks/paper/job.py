@@ -7,15 +7,13 @@ from __future__ import annotations
 
 import json
 import resource
-import subprocess
 import sys
-import time
 from collections.abc import Callable
-from datetime import date
 from pathlib import Path
 
 import numpy as np
 
+from tests.benchmarks.circumstances import here
 from tests.benchmarks.paper import ours
 from tests.benchmarks.paper.experiments import EXPERIMENTS
 from tests.benchmarks.paper.peers import PEERS
@@ -32,7 +30,7 @@ METHODS: dict[str, Callable[[Task], Outcome]] = {
 def work(experiment: str, method: str, seed: int, file: Path) -> None:
     """Learn, predict, score; write the scores as JSON and the predictions beside them."""
     chosen = EXPERIMENTS[experiment]
-    circumstances = here()
+    circumstances = here()  # before the machine is busy
     task, tests, clean = chosen.task(seed)
     outcome = METHODS[method](task)
     memory = max(
@@ -67,19 +65,6 @@ def work(experiment: str, method: str, seed: int, file: Path) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(file.with_suffix(".npz"), **arrays)
     file.write_text(json.dumps(row, indent=1))
-
-
-def here() -> dict[str, str | float]:
-    """Day, commit, and seconds of a fixed calculation, which tells machines apart."""
-    commit = subprocess.run(
-        ["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=True
-    ).stdout.strip()
-    begin = time.perf_counter()
-    total = 0
-    for k in range(10_000_000):
-        total += k
-    seconds = time.perf_counter() - begin
-    return {"date": f"{date.today()}", "commit": commit, "reference_seconds": seconds}
 
 
 def against_clean(mean: np.ndarray, y: np.ndarray, clean: np.ndarray) -> dict[str, float]:

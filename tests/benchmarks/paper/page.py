@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 import pyro_dynogp as dgp
+from tests.benchmarks.circumstances import sentence
 from tests.benchmarks.markdown import table
 from tests.benchmarks.paper.bound import System, clean_error_bound
 from tests.benchmarks.paper.experiments import EXPERIMENTS, Experiment
@@ -62,7 +63,7 @@ def _section(experiment: Experiment, rows: Sequence[Row], folder: Path, picture:
         if len(names) > 1:
             parts.append(f"Test record: {name}.")
         parts.append(_table(experiment, done, name, published=name == names[0]))
-    parts += [_costs(done), _machines(done)]
+    parts += [_costs(done), sentence(done)] if done else []
     parts += _targets(experiment, done)
     if experiment.system is not None:
         parts += _against_peers(done, experiment.system)
@@ -131,19 +132,6 @@ def _costs(rows: Sequence[Row]) -> str:
             spread(np.array([row["memory_gb"] for row in own])),
         ])  # fmt: skip
     return table(lines[0], lines[1:])
-
-
-def _machines(rows: Sequence[Row]) -> str:
-    """When and with which commit jobs ran, and how fast the machine was."""
-    runs: dict[tuple[str, str], list[Row]] = {}
-    for row in rows:
-        runs.setdefault((row["date"], row["commit"]), []).append(row)
-    found = []
-    for (date, commit), own in sorted(runs.items()):
-        methods = ", ".join(_methods(own)) if len(runs) > 1 else "all"
-        seconds = spread(np.array([row["reference_seconds"] for row in own]))
-        found.append(f"{date}, commit {commit}, ten million additions took {seconds} s ({methods})")
-    return f"Run on {'; '.join(found)}."
 
 
 LENGTHS: dict[str, int] = {}

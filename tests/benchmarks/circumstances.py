@@ -1,0 +1,48 @@
+"""When, with which commit, and on how fast a machine a row of a study was made."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import time
+from collections.abc import Mapping, Sequence
+from datetime import date
+from functools import cache
+from typing import Any
+
+ADDITIONS = 10_000_000
+
+
+@cache
+def here() -> dict[str, str | float]:
+    """Day, commit, and seconds of a fixed calculation, which tells machines apart.
+
+    The commit is "unknown" outside a repository.
+    """
+    commit = "unknown"
+    if shutil.which("git"):
+        said = subprocess.run(
+            ["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=False
+        )
+        commit = said.stdout.strip() or commit
+    begin = time.perf_counter()
+    total = 0
+    for k in range(ADDITIONS):
+        total += k
+    seconds = time.perf_counter() - begin
+    return {"date": f"{date.today()}", "commit": commit, "reference_seconds": seconds}
+
+
+def sentence(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Where the rows come from; one that does not say is of an unknown run."""
+    runs: dict[tuple[str, str], list[float]] = {}
+    for row in rows:
+        key = (row.get("date", "unknown day"), row.get("commit", "unknown"))
+        runs.setdefault(key, []).append(row.get("reference_seconds", float("nan")))
+    found = [
+        f"{count} on {day} with commit {commit} (ten million additions took {low:.2g} to "
+        f"{high:.2g} s)"
+        for (day, commit), seconds in sorted(runs.items())
+        for count, low, high in [(len(seconds), min(seconds), max(seconds))]
+    ]
+    return f"Runs: {'; '.join(found)}."
