@@ -157,18 +157,18 @@ def test_finished_jobs_are_not_run_again_and_failures_are_kept(tmp_path, monkeyp
     assert "failed, stopped after" in text
     run.run(tmp_path, ["electricity"], ["dynoNet"])
     assert len(calls) == 1
-    ((job, row),) = run.read_rows(run.KEPT).items()
+    ((job, row),) = run.kept_rows(run.KEPT).items()
     assert job == ("electricity", "dynoNet", 0)
     assert row["failed"] == "stopped after 3000 s"
 
 
 def test_rows_that_are_kept(tmp_path):
     path = tmp_path / "new" / "rows.jsonl"
-    assert run.read_rows(path) == {}
+    assert run.kept_rows(path) == {}
     late, early = row("drives_2", "dynoNet", 1, 0.11), row("drives_1", "dynoNet", 0, 0.123456789)
     for one in (late, early, {**late, "seconds": 20.0}):
         run.keep(path, one)
-    found = run.read_rows(path)
+    found = run.kept_rows(path)
     assert list(found) == [("drives_1", "dynoNet", 0), ("drives_2", "dynoNet", 1)]
     assert found["drives_1", "dynoNet", 0]["scores"]["test"]["rmse"] == 0.123457
     assert found["drives_2", "dynoNet", 1]["seconds"] == 20.0

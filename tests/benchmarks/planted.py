@@ -8,7 +8,6 @@ made in parts; a line says with which commit.
 
 from __future__ import annotations
 
-import json
 import re
 import time
 import traceback
@@ -22,12 +21,14 @@ import numpy as np
 import pyro_dynogp as dgp
 from pyro_dynogp.parallel import parallel_map
 from tests.benchmarks.circumstances import here
+from tests.benchmarks.kept_rows import append_row, read_rows
 from tests.benchmarks.planted_table import NOTHING, confusion_picture, is_right, tables
 from tests.discrepancy.plants import EFFECTS, STRENGTHS, Plant, Strength, plant
 
 # One round: what is named first, and what adding it brings.
 SAMPLES, INDUCING, ROUNDS = 1200, 16, 1
 KEPT = Path("docs/planted")
+KEY = ("effect", "strength", "replicate", "split")
 SCORES = ("rmse", "mae", "crps", "coverage_95")
 
 
@@ -137,24 +138,6 @@ def channel_of(effect: Any, names: Iterable[str]) -> str | None:
     return next((n for n in names if re.search(rf"(?<!\w){re.escape(n)}(?!\w)", text)), None)
 
 
-def read_rows(path: Path) -> list[dict[str, Any]]:
-    """Rows of a study so far, the last of each case; without a line that a kill has cut short."""
-    rows: dict[tuple[str, str, int, str], dict[str, Any]] = {}
-    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
-        try:
-            row = json.loads(line)
-        except json.JSONDecodeError:
-            continue
-        rows[(row["effect"], row["strength"], row["replicate"], row["split"])] = row
-    return list(rows.values())
-
-
-def _append(path: Path, row: Mapping[str, Any]) -> None:
-    """One write of one line, after a fresh start of line: safe beside other processes."""
-    with path.open("a", encoding="utf-8") as file:
-        file.write("\n" + json.dumps(row) + "\n")
-
-
 def _work(task: tuple[Case, Path]) -> dict[str, Any]:
     case, path = task
     try:
@@ -163,7 +146,7 @@ def _work(task: tuple[Case, Path]) -> dict[str, Any]:
         traceback.print_exc()
         row = {**asdict(case), "effect": case.effect or NOTHING}
         row["error"] = f"{type(error).__name__}: {error}"
-    _append(path, row)
+    append_row(path, row)
     return row
 
 
@@ -195,13 +178,10 @@ def run(
         kept: folder of `planted.<split>.jsonl`, a line for each case; delete it after a change of
             the search or of the plants.
     """
-    kept.mkdir(parents=True, exist_ok=True)
     path = kept / f"planted.{split}.jsonl"
     wanted = cases_of(replicates, effects, split, strengths, kind)
-    rows = {
-        (r["effect"], r["strength"], r["replicate"], r["split"]): r
-        for r in read_rows(path)
-        if "error" not in r
+    rows: dict[Any, dict[str, Any]] = {
+        key: row for key, row in read_rows(path, KEY).items() if "error" not in row
     }
     missing = [(case, path) for case in wanted if case.key not in rows]
     if missing:

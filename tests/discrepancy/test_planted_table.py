@@ -8,7 +8,8 @@ import pytest
 
 import pyro_dynogp as dgp
 from tests.benchmarks import planted
-from tests.benchmarks.planted import Case, cases_of, channel_of, collect, read_rows
+from tests.benchmarks.kept_rows import read_rows
+from tests.benchmarks.planted import KEY, Case, cases_of, channel_of, collect
 from tests.benchmarks.planted_table import (
     NOTHING,
     confusion,
@@ -183,7 +184,7 @@ def test_an_interrupted_study_goes_on(tmp_path, monkeypatch):
     path = tmp_path / "planted.development.jsonl"
     with path.open("a") as file:  # a kill in the middle of a line
         file.write('{"effect": "drift", "strength"')
-    assert len(read_rows(path)) == 6
+    assert len(read_rows(path, KEY)) == 6
     asked.clear()
     planted.run(tmp_path, replicates=2, effects=["drift", None], workers=1, kept=tmp_path)
     assert ("drift", "weak", 0, "development") in asked  # what failed is tried again

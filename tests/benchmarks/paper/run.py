@@ -16,6 +16,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from tests.benchmarks.kept_rows import append_row, read_rows
 from tests.benchmarks.paper.experiments import EXPERIMENTS
 from tests.benchmarks.paper.job import METHODS
 from tests.benchmarks.paper.ours import STACK
@@ -26,6 +27,7 @@ from tests.benchmarks.paper.prediction import OURS, folder_name
 # run again.
 PICTURES = Path("docs/paper")
 KEPT = PICTURES / "rows.jsonl"
+KEY = ("experiment", "method", "seed")
 # A method is given this many times its budget before it is stopped; it should stop by itself.
 GRACE = 4.0
 
@@ -65,30 +67,29 @@ def run(
         experiments, methods: names, all by default.
     """
     base = folder / "paper"
-    rows = read_rows(KEPT)
+    rows = kept_rows(KEPT)
     missing = [job for job in jobs(experiments, methods) if job not in rows]
     bar = tqdm(missing, desc="paper", disable=not missing)
     for job in bar:
         bar.set_postfix_str(f"{job[1]}, {job[0]}, seed {job[2]}")
         _one(base, job)
         keep(KEPT, json.loads(file_of(base, job).read_text()))
-    return page(list(read_rows(KEPT).values()), base, PICTURES)
+    return page(list(kept_rows(KEPT).values()), base, PICTURES)
 
 
-def read_rows(path: Path) -> dict[tuple[str, str, int], dict[str, Any]]:
-    """What finished jobs have found, in the order of `jobs`; the last line of each counts."""
-    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    rows = {(r["experiment"], r["method"], r["seed"]): r for r in map(json.loads, lines)}
+def kept_rows(path: Path) -> dict[Any, dict[str, Any]]:
+    """What finished jobs have found, in the order of `jobs`."""
     order = {job: place for place, job in enumerate(jobs())}
+    rows: dict[Any, dict[str, Any]] = dict(read_rows(path, KEY))
     return dict(sorted(rows.items(), key=lambda one: order.get(one[0], len(order))))
 
 
 def keep(path: Path, row: dict[str, Any]) -> None:
-    """Add the row of a job, figures to six digits; one write, safe beside other processes."""
-    short = json.loads(json.dumps(row), parse_float=lambda text: float(f"{float(text):.6g}"))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(short) + "\n")
+    """Add the row of a job, figures to six digits."""
+    append_row(
+        path,
+        json.loads(json.dumps(row), parse_float=lambda text: float(f"{float(text):.6g}")),
+    )
 
 
 def file_of(base: Path, job: tuple[str, str, int]) -> Path:
