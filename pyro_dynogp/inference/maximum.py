@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from scipy.optimize import minimize
 from torch import Tensor
 
 from pyro_dynogp.inference.checkpoints import (
@@ -19,6 +18,7 @@ from pyro_dynogp.inference.checkpoints import (
     tensor_text,
     text_tensor,
 )
+from pyro_dynogp.inference.descent import descend
 from pyro_dynogp.inference.lockstep import Functions, in_lockstep
 from pyro_dynogp.inference.potential import Potential
 from pyro_dynogp.parallel import parallel_map, seeded
@@ -51,7 +51,7 @@ class Optimum:
 
 @dataclass(frozen=True)
 class _Task:
-    """Starts that climb together."""
+    """Starts that climb together; `goes_on` says that they have climbed already."""
 
     model: Any
     records: Record | Sequence[Record]
@@ -62,36 +62,24 @@ class _Task:
     checkpoints: Checkpoints
     key: str
     rate: float
+    goes_on: bool
 
 
 def _lbfgs(
-    functions: Functions, z: np.ndarray, steps: int, rate: float
+    functions: Functions, z: np.ndarray, task: _Task, every: int
 ) -> tuple[np.ndarray, list, str]:
-    del rate  # its line search finds the step
-    history: list[float] = []
-
-    def function(x: np.ndarray) -> tuple[float, np.ndarray]:
-        values, gradients = functions(x[None])
-        return float(values[0]), gradients[0]
-
-    result = minimize(
-        function,
-        z,
-        jac=True,
-        method="L-BFGS-B",
-        callback=lambda intermediate_result: history.append(float(intermediate_result.fun)),
-        options={"maxiter": steps, "maxfun": 2 * steps, "maxcor": 20, "ftol": 1e-7},
-    )
-    return result.x, history, str(result.message)
+    return descend(functions, z, task.steps, every=every, first=0 if task.goes_on else None)
 
 
 def _adam(
-    functions: Functions, z: np.ndarray, steps: int, rate: float
+    functions: Functions, z: np.ndarray, task: _Task, every: int
 ) -> tuple[np.ndarray, list, str]:
     """Adam with a falling step; back to the best point with a shorter one where it got lost.
 
     Its first steps have full length in every direction, however good the start is.
     """
+    del every  # of Hessians, of which it has none
+    steps, rate = task.steps, task.rate
     x, optimizer, schedule = _from(z, rate, steps)
     history: list[float] = []
     best, best_z = np.inf, z
@@ -138,10 +126,11 @@ def _climb(task: _Task) -> list[Optimum]:
     with seeded(task.seed):
         potential = Potential(task.model, (task.records,), task.starts[0])
         method = _METHODS[task.optimizer]
+        every = potential.hessian_cost  # of a climb, Hessians are at most half the work
 
         def run(start: dict[str, Tensor]) -> Callable[[Functions], tuple[np.ndarray, list, str]]:
             z = potential.pack(start).numpy()
-            return lambda functions: method(functions, z, task.steps, task.rate)
+            return lambda functions: method(functions, z, task, every)
 
         found = in_lockstep(potential.values_and_gradients, [run(start) for start in task.starts])
         ends = np.stack([z for z, _, _ in found])
@@ -228,6 +217,7 @@ def maximise(
                 checkpoints,
                 f"{key}-{label}-{i}",
                 rate,
+                label == "optima",
             )
             for i, batch in enumerate(_batches(values, model, records, together))
         ]

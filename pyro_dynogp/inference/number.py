@@ -18,9 +18,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize
 
-from pyro_dynogp.inference.potential import WALL, Potential, laplace_root
+from pyro_dynogp.inference.descent import bounded_root, piece
+from pyro_dynogp.inference.potential import WALL, Potential
 
 # Nats below the top at which the density counts as zero; points of the grid for one number and for
 # each of two; how often a range is doubled or halved to find that depth.
@@ -29,6 +29,8 @@ DEPTH, POINTS, DOUBLINGS = 9.0, (21, 9), 20
 CLOSER = 4
 # Most steps of the sites to their mode.
 ITERATIONS = 60
+# Gradient, in coordinates that are round at the fitted number, at which they are there.
+FLAT = 0.03
 # Standard deviation of an unconstrained site in whose direction the density is flat.
 WIDEST = 3.0
 
@@ -64,7 +66,7 @@ def number_posterior(
     steps = np.array([one.step for one in numbers])
     first = potential(centre)
     z = first.pack(first.at).numpy()
-    root = laplace_root(first.hessian(z), widest=WIDEST)
+    root = bounded_root(first.hessian(z), widest=WIDEST)
     known: dict[tuple[float, ...], tuple[float, np.ndarray]] = {}
 
     def energy(values: Sequence[float]) -> float:
@@ -101,20 +103,9 @@ def number_posterior(
 
 
 def _lowest(potential: Potential, z: np.ndarray, root: np.ndarray) -> tuple[float, np.ndarray]:
-    """Lowest energy from a point on, and where it is; in coordinates x of z + root x."""
-
-    def function(x: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = potential.value_and_gradient(z + root @ x, jacobian=True)
-        return value, root.T @ gradient
-
-    found = minimize(
-        function,
-        np.zeros(len(z)),
-        jac=True,
-        method="L-BFGS-B",
-        options={"maxiter": ITERATIONS, "ftol": 1e-6},
-    )
-    return (found.fun if found.fun < WALL else np.inf), z + root @ found.x
+    """Lowest energy from a point on, to a hundredth of a nat, and where it is."""
+    z, energy, _ = piece(potential.with_jacobian, z, root, ITERATIONS, [], flat=FLAT)
+    return (energy if energy < WALL else np.inf), z
 
 
 def _range(

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pyro
 import torch
-from scipy.optimize import minimize
 from torch import Tensor
 from torch.distributions import biject_to
 from torch.distributions.transforms import Transform
 
 from pyro_dynogp._errors import invalid
+from pyro_dynogp.inference.descent import bounded_root, descend, hessian
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
 
 # Energy where there is no density.
@@ -24,6 +24,8 @@ WALL = 1e15
 # Samples in all, over the points of a batch, up to which more points cost less than one by one:
 # above, the compiled recursions are what an evaluation costs.
 AT_ONCE = 12_000
+# Most iterations to the mode of the unconstrained vector's density.
+LAPLACE_STEPS = 120
 
 
 @dataclass(frozen=True)
@@ -180,6 +182,11 @@ class Potential:
         """Length of the unconstrained vector."""
         return sum(site.unconstrained.numel() for site in self.sites)
 
+    @property
+    def hessian_cost(self) -> int:
+        """Evaluations, of `width` points each, that one-sided differences take for a Hessian."""
+        return -(-self.size // self.width)
+
     def pack(self, values: Mapping[str, Tensor]) -> Tensor:
         """Constrained values of every site to the unconstrained vector (d,), finite.
 
@@ -239,13 +246,11 @@ class Potential:
 
     def hessian_of(self, z: np.ndarray, some: Sequence[int], *, step: float = 1e-4) -> np.ndarray:
         """Rows and columns of `hessian` that belong to some entries of z."""
-        places = list(some)
-        shifts = np.zeros((len(places), len(z)))
-        shifts[np.arange(len(places)), places] = step
-        both = np.concatenate([z + shifts, z - shifts])
-        up, down = np.split(self.values_and_gradients(both, jacobian=True)[1], 2)
-        H = ((up - down) / (2.0 * step))[:, places]
-        return np.asarray(0.5 * (H + H.T))
+        return hessian(self.with_jacobian, z, some, step=step)
+
+    def with_jacobian(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Energies (k,) and gradients (k, d) of the unconstrained vector's density."""
+        return self.values_and_gradients(z, jacobian=True)
 
     def log_evidence(self, values: Mapping[str, Tensor], *, widest: float) -> float:
         """Laplace's approximation of log p(y) from the neighbourhood of `values` alone [nats].
@@ -267,27 +272,12 @@ class Potential:
         The centre is the mode of that vector's own density (with Jacobian), climbed to from
         `values`: the mode of the constrained density can lie on a boundary, at minus infinity.
         """
-        result = minimize(
-            lambda z: self.value_and_gradient(z, jacobian=True),
-            self.pack(values).numpy(),
-            jac=True,
-            method="L-BFGS-B",
-            options={"maxiter": 300, "ftol": 1e-9},
+        every = self.hessian_cost
+        z, _, _ = descend(
+            self.with_jacobian, self.pack(values).numpy(), LAPLACE_STEPS, every=every, first=0
         )
-        return result.x, laplace_root(self.hessian(result.x), widest=widest)
+        return z, bounded_root(self.hessian(z), widest=widest)
 
 
 # Unconstrained value of what lies on a boundary: within 1e-13 of it.
 EDGE = 30.0
-
-
-def laplace_root(hessian: np.ndarray, *, widest: float) -> np.ndarray:
-    """Lower Cholesky factor of the inverse Hessian.
-
-    Directions in which the density is flat or curves upwards get the standard deviation `widest`
-    (unconstrained units), so that the result is always a usable scale.
-    """
-    eigenvalues, vectors = np.linalg.eigh(hessian)
-    bounded = np.maximum(eigenvalues, widest**-2)
-    covariance = (vectors / bounded) @ vectors.T
-    return np.linalg.cholesky(0.5 * (covariance + covariance.T))

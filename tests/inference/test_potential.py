@@ -9,7 +9,8 @@ from scipy import stats
 from scipy.optimize import approx_fprime
 
 import pyro_dynogp as dgp
-from pyro_dynogp.inference.potential import Potential, laplace_root
+from pyro_dynogp.inference.descent import bounded_root
+from pyro_dynogp.inference.potential import Potential
 from pyro_dynogp.inference.starts import starting_values
 
 
@@ -70,7 +71,7 @@ def test_jacobian_makes_a_density_of_the_unconstrained_vector():
         assert got == pytest.approx(float(expected), rel=1e-6)
 
 
-def test_hessian_and_laplace_root_of_a_normal():
+def test_hessian_and_bounded_root_of_a_normal():
     covariance = np.array([[2.0, 0.6], [0.6, 0.5]])
 
     def model():
@@ -80,12 +81,12 @@ def test_hessian_and_laplace_root_of_a_normal():
     function = Potential(model, (), {"x": torch.zeros(2, dtype=torch.float64)})
     H = function.hessian(np.array([0.2, -0.1]))
     np.testing.assert_allclose(H, np.linalg.inv(covariance), rtol=1e-6)
-    root = laplace_root(H, widest=10.0)
+    root = bounded_root(H, widest=10.0)
     np.testing.assert_allclose(root @ root.T, covariance, rtol=1e-6)
 
 
-def test_laplace_root_bounds_flat_directions():
-    root = laplace_root(np.diag([4.0, 0.0, -1.0]), widest=3.0)
+def test_bounded_root_bounds_flat_directions():
+    root = bounded_root(np.diag([4.0, 0.0, -1.0]), widest=3.0)
     np.testing.assert_allclose(np.diag(root @ root.T), [0.25, 9.0, 9.0])
 
 
