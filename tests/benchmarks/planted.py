@@ -8,6 +8,7 @@ made in parts; a line says with which commit.
 
 from __future__ import annotations
 
+import itertools
 import re
 import time
 import traceback
@@ -66,8 +67,9 @@ def cases_of(
         many = count * replicates if effect is None else replicates
         levels = ("none",) if effect is None else strengths
         for level in levels:
-            numbers = [n for n in range(20 * many if kind else many) if
-                       kind is None or _kind(effect, level, n, split) == kind]  # fmt: skip
+            plants = range(20 * many) if kind else range(many)
+            suited = (n for n in plants if kind is None or _kind(effect, level, n, split) == kind)
+            numbers = itertools.islice(suited, many)
             order = [k // count if effect is None else k for k in range(many)]
             found += [
                 (k, Case(effect, level, n, split)) for k, n in zip(order, numbers, strict=False)
