@@ -1,10 +1,10 @@
 """Posterior of numbers that a model is made with rather than samples: a delay, a limit, a period.
 
 Such a number moves an input along the time axis or bends it, and the density is not smooth in it.
-At each value of a grid the sample sites climb to their mode again, in coordinates that are round at
-the fitted number, and
+At each of several values the sample sites climb to their mode again, in coordinates that are round
+at the fitted number, and
 
-    p(number | y) = exp(-E(number)) / sum over the grid,
+    p(number | y) = exp(-E(number)) / integral over the number,
 
 E the negative log joint density at that mode. This is Laplace's approximation of the integral over
 the sites (Tierney & Kadane, J. Am. Stat. Assoc. 81:82, 1986) with one curvature for all values of
@@ -18,19 +18,24 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 
 from pyro_dynogp.inference.descent import bounded_root, piece
 from pyro_dynogp.inference.potential import WALL, Potential
 
-# Nats below the top at which the density counts as zero; points of the grid for one number and for
-# each of two; how often a range is doubled or halved to find that depth.
-DEPTH, POINTS, DOUBLINGS = 9.0, (21, 9), 20
-# How often a grid that is too coarse is drawn again.
-CLOSER = 4
+# Nats below the top at which the density counts as zero; how often a range is doubled or halved to
+# find that depth; points of the grid for each of two numbers.
+DEPTH, DOUBLINGS, POINTS = 9.0, 20, 9
+# Points for one number: for each step of the first scan, of all of it at least and at most, and in
+# all.
+SCANNED, SCAN, MOST = 8, (17, 33), 80
+# Peaks are looked for up to so many nats below the top, and a point goes where it promises so many;
+# so much of the mass is too much between two points.
+RISE, NEWS, SHARE = 60.0, 0.3, 0.1
 # Most steps of the sites to their mode.
-ITERATIONS = 60
+ITERATIONS = 30
 # Gradient, in coordinates that are round at the fitted number, at which they are there.
-FLAT = 0.03
+FLAT = 0.05
 # Standard deviation of an unconstrained site in whose direction the density is flat.
 WIDEST = 3.0
 
@@ -82,28 +87,99 @@ def number_posterior(
                 known[key] = np.inf, start
         return known[key][0]
 
+    if len(numbers) == 1:
+        return [_alone(lambda value: energy([value]), numbers[0])]
     ranges = [_range(energy, centre, k, one) for k, one in enumerate(numbers)]
-    points = POINTS[len(numbers) - 1]
-    for _ in range(CLOSER if len(numbers) == 1 else 1):
-        grid = [np.linspace(low, high, points) for low, high in ranges]
-        heights = np.array([energy(values) for values in itertools.product(*grid)])
-        density = np.exp(heights.min() - heights).reshape([points] * len(grid))
-        closer = [_where(density, axis, one) for axis, one in enumerate(grid)]
-        # A grid that is too coarse for the top, as where the first range had none of it.
-        if all(b - a > 0.5 * (d - c) for (a, b), (c, d) in zip(closer, ranges, strict=True)):
-            break
-        ranges = closer
+    grid = [np.linspace(low, high, POINTS) for low, high in ranges]
+    heights = np.array([energy(values) for values in itertools.product(*grid)])
+    density = np.exp(heights.min() - heights).reshape([POINTS] * len(grid))
     found = []
     for axis, one in enumerate(grid):
-        share = _along(density, axis)
-        share = share / share.sum()
-        mean = float(share @ one)
-        found.append((mean, float(np.sqrt(share @ (one - mean) ** 2))))
+        share = density.sum(tuple(other for other in range(density.ndim) if other != axis))
+        found.append(_moments(one, share / share.sum()))
     return found
 
 
+def _alone(energy: Callable[[float], float], number: Number) -> tuple[float, float]:
+    """Posterior mean and standard deviation of one number, whose density may have many peaks.
+
+    Points go where peaks may be, half a step apart or more, then where mass is. A dead time is an
+    example: neighbouring numbers of samples explain a record nearly as well, and times between them
+    do not.
+    """
+    low, high = (_end(energy, number, side) for side in (-1.0, 1.0))
+    count = int(np.clip(SCANNED * (high - low) / number.step, *SCAN))
+    at = np.unique(np.append(np.linspace(low, high, count), number.at))
+    known = {float(x): energy(float(x)) for x in sorted(at, key=lambda x: abs(x - number.at))}
+    while len(known) < MOST:
+        x = np.array(sorted(known))
+        E = _capped(np.array([known[float(one)] for one in x]))
+        new = _peak(x, E)
+        if new is None:
+            new = _midpoint(x, E)
+        if new is None:
+            break
+        known[new] = energy(new)
+    x = np.array(sorted(known))
+    E = _capped(np.array([known[float(one)] for one in x]))
+    fine = np.unique(np.concatenate([np.linspace(a, b, 20) for a, b in itertools.pairwise(x)]))
+    density = np.exp(E.min() - PchipInterpolator(x, E)(fine))
+    share = density * np.gradient(fine)
+    return _moments(fine, share / share.sum())
+
+
+def _capped(E: np.ndarray) -> np.ndarray:
+    """Energies, where they are high or infinite as high as peaks are looked for."""
+    return np.asarray(np.minimum(E, E.min() + RISE))
+
+
+def _peak(x: np.ndarray, E: np.ndarray) -> float | None:
+    """Where a parabola through a low point and its neighbours says that a peak with mass is."""
+    for i in 1 + np.flatnonzero((E[1:-1] <= E[:-2]) & (E[1:-1] <= E[2:])):
+        left, right = x[i] - x[i - 1], x[i + 1] - x[i]
+        up, down = (E[i + 1] - E[i]) / right, (E[i - 1] - E[i]) / left
+        curvature = (up + down) / (left + right)
+        if curvature <= 0.0:
+            continue
+        slope = (up * left - down * right) / (left + right)
+        lower = slope**2 / (4.0 * curvature)  # than the point
+        place = x[i] - slope / (2.0 * curvature)
+        if lower > NEWS and E[i] - lower < E.min() + DEPTH:
+            return float(place)
+    return None
+
+
+def _midpoint(x: np.ndarray, E: np.ndarray) -> float | None:
+    """Middle of the interval that may hold most, where that is much."""
+    density = np.exp(E.min() - E)
+    wide = np.diff(x)
+    most = wide * np.maximum(density[1:], density[:-1])
+    total = float((0.5 * wide * (density[1:] + density[:-1])).sum())
+    i = int(most.argmax())
+    return float(0.5 * (x[i] + x[i + 1])) if most[i] > SHARE * total else None
+
+
+def _end(energy: Callable[[float], float], number: Number, side: float) -> float:
+    """A value on one side beyond which the density is zero, a step away at least."""
+    bound = number.low if side < 0.0 else number.high
+    lowest, width = energy(number.at), number.step
+    for _ in range(DOUBLINGS):
+        value = _within(number.at + side * width, bound, side)
+        here = energy(value)
+        lowest = min(lowest, here)
+        if value == bound or here > lowest + DEPTH:
+            break
+        width *= 2.0
+    return value
+
+
+def _moments(x: np.ndarray, share: np.ndarray) -> tuple[float, float]:
+    mean = float(share @ x)
+    return mean, float(np.sqrt(share @ (x - mean) ** 2))
+
+
 def _lowest(potential: Potential, z: np.ndarray, root: np.ndarray) -> tuple[float, np.ndarray]:
-    """Lowest energy from a point on, to a hundredth of a nat, and where it is."""
+    """Lowest energy from a point on, to a few hundredths of a nat, and where it is."""
     z, energy, _ = piece(potential.with_jacobian, z, root, ITERATIONS, [], flat=FLAT)
     return (energy if energy < WALL else np.inf), z
 
@@ -137,15 +213,3 @@ def _range(
 
 def _within(value: float, bound: float, side: float) -> float:
     return max(value, bound) if side < 0.0 else min(value, bound)
-
-
-def _along(density: np.ndarray, axis: int) -> np.ndarray:
-    """Density of one number, the other summed out."""
-    others = tuple(a for a in range(density.ndim) if a != axis)
-    return np.asarray(density.sum(others))
-
-
-def _where(density: np.ndarray, axis: int, grid: np.ndarray) -> tuple[float, float]:
-    """Range of a grid on which the density is not zero, with a point on either side."""
-    there = np.flatnonzero(_along(density, axis) > np.exp(-DEPTH))
-    return float(grid[max(there[0] - 1, 0)]), float(grid[min(there[-1] + 1, len(grid) - 1)])

@@ -168,16 +168,24 @@ def test_a_smooth_signal_is_easier_to_fill_in_than_to_forecast(one_pair):
 
 
 def test_forecasts_with_refits_against_fits_to_the_past(linear, short):
-    """Ratios and refits forwards, against fits to the past alone of four forecasts."""
+    """Ratios and refits forwards, against fits to the past alone of some forecasts.
+
+    Compared are those whose own weights have a variance (Pareto shape below 1/2).
+    """
     found = dgp.loo(linear, target="forecast", begin=30, draws=250, **QUIET)
     subject = FitSubject(linear, linear.records, 250, 0)
     assert found["not_refitted"] == 0
     assert 1 < found["refits"] < 15
-    for i in (30, 45, 50, 55):
+    compared = 0
+    for i in (30, 35, 45, 50, 55):
         other = subject.without(np.arange(60) >= i)
         density = other.pointwise("forecast")[:, i]
-        exact = float(logsumexp(arviz_bridge.psis(other.draws.log_ratio)[0] + density))
-        assert float(found.loo_i[i - 30]) == pytest.approx(exact, abs=0.15)
+        weights, k = arviz_bridge.psis(other.draws.log_ratio)[:2]
+        if k < 0.5:
+            exact = float(logsumexp(weights + density))
+            assert float(found.loo_i[i - 30]) == pytest.approx(exact, abs=0.15)
+            compared += 1
+    assert compared >= 2
 
 
 def test_forecasts_without_refits_flatter(linear):

@@ -123,3 +123,28 @@ def test_intervals_cover_the_truth_as_often_as_they_say():
     # 200 intervals of 90 %: three standard errors of such a share, and of the sd of 200 errors.
     assert inside == pytest.approx(0.9, abs=3 * np.sqrt(0.09 / 200))
     assert np.std(z) == pytest.approx(1.0, abs=0.16)
+
+
+def comb(values):
+    """Peaks half a unit apart and 30 nats high under a wide one, and no sites that matter."""
+    (x,) = values
+    ripple = -15.0 * (1.0 - np.cos(4.0 * np.pi * x))
+    log_density = torch.tensor(ripple - 0.5 * ((x - 2.2) / 0.3) ** 2)
+
+    def model():
+        pyro.sample("gain", dist.Normal(torch.tensor(0.0).double(), 1.0))
+        pyro.factor("comb", log_density)
+
+    return Potential(model, (), {"gain": torch.tensor(0.0).double()})
+
+
+@pytest.mark.parametrize(("at", "step"), [(2.0, 1.0), (2.52, 1.0), (1.5, 1.0)])
+def test_all_peaks_of_a_comb_are_found(at, step):
+    ((mean, sd),) = number_posterior(comb, [Number(at, step)])
+    fine = np.linspace(0.0, 4.4, 20_000)
+    gain = {"gain": torch.tensor(0.0).double()}
+    share = np.exp([float(comb([x]).log_joint(gain)) for x in fine])
+    share /= share.sum()
+    expected = share @ fine
+    assert mean == pytest.approx(expected, abs=0.03)
+    assert sd == pytest.approx(np.sqrt(share @ (fine - expected) ** 2), rel=0.05)
