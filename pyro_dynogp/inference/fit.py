@@ -88,8 +88,9 @@ def fit(
         steps: most iterations of a start (default 500; Adam 1500; cascade 600) and, with "svi", of
             SVI (default 1000; cascade 60, and no more while its hyperparameters stay at the
             optimum, around which it begins all but normal).
-        optimizer: "lbfgs" or "adam", for the starts; "adam" by default for a cascade, whose density
-            has long ridges on which line searches stop, or lead to where noise is fitted.
+        optimizer: "lbfgs" (in coordinates that Hessians make round, to the top of a ridge) or
+            "adam", for the starts; "adam" by default for a cascade, whose highest mode may be one
+            that fits the noise.
         draws: posterior draws to keep ("svi", default 200) or to sample per chain ("nuts", 500).
         chains, warmup: of NUTS.
         particles, learning_rate: of SVI.
