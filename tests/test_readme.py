@@ -49,7 +49,7 @@ def test_a_deep_model_is_fitted(tmp_path, monkeypatch, one_pair):
     names: dict = {"dgp": dgp, "train": simulate_record(one_pair, 0.1, n=60)}
     exec(code, names)
     assert names["fit"].method == "svi"
-    assert len(names["fit"].elbo) == 3
+    assert 1 <= len(names["fit"].elbo) <= 3  # one where Laplace's approximation will do
     assert (tmp_path / "run1").is_dir()
 
 

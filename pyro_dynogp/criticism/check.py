@@ -180,6 +180,9 @@ def _chains(fit: Fit) -> list[Finding]:
 def _elbo(fit: Fit) -> Finding:
     """Whether the last fifth of the steps lies above the fifth before it, beyond its noise."""
     history = np.asarray(fit.history)
+    if len(history) == 1:  # no course to judge
+        text = "of Laplace's approximation, too close for SVI to start, or of a single step"
+        return Finding("ELBO", float(history[0]), None, text)
     fifth = max(len(history) // 5, 2)
     last, before = history[-fifth:], history[-2 * fifth : -fifth]
     if len(before) < 2:

@@ -204,7 +204,10 @@ def _linear(
             starts.append(values_given_poles(model, records, model.scaling, kept)[1])
     if base is not None and not isinstance(base.model, Cascade):
         starts.append(grown(base.mode, starts[-1]))
-    return maximise(model, records[0], starts, steps=steps, seed=seed, workers=1, together=TOGETHER)
+    return maximise(
+        model, records[0], starts, optimizer="preconditioned", steps=steps, seed=seed, workers=1,
+        together=TOGETHER,
+    )  # fmt: skip
 
 
 def _cascade(

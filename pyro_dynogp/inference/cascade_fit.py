@@ -176,7 +176,9 @@ def grow(
     Process noise that has explained what the smaller model lacks keeps the larger one from
     explaining it: one climb goes without any first, and takes that of `start` then.
     """
-    options: dict[str, Any] = {"steps": steps, "seed": seed, "workers": 1}
+    options: dict[str, Any] = {
+        "steps": steps, "seed": seed, "workers": 1, "optimizer": "preconditioned",
+    }  # fmt: skip
     starts = [learnt]
     quiet = without_process_noise(model)
     if quiet != model:

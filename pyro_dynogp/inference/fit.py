@@ -88,9 +88,9 @@ def fit(
         steps: most iterations of a start (default 500; Adam 1500; cascade 600) and, with "svi", of
             SVI (default 1000; cascade 60, and no more while its hyperparameters stay at the
             optimum, around which it begins all but normal).
-        optimizer: "lbfgs" (in coordinates that Hessians make round, to the top of a ridge) or
-            "adam", for the starts; "adam" by default for a cascade, whose highest mode may be one
-            that fits the noise.
+        optimizer: "lbfgs", "preconditioned" (L-BFGS in coordinates that Hessians make round, which
+            gets to the top of long ridges) or "adam", for the starts; "lbfgs" by default for a
+            linear model, "adam" for a cascade. The highest mode may be one that fits the noise.
         draws: posterior draws to keep ("svi", default 200) or to sample per chain ("nuts", 500).
         chains, warmup: of NUTS.
         particles, learning_rate: of SVI.
@@ -110,8 +110,9 @@ def fit(
         raise invalid("method", expected="'map', 'svi' or 'nuts'", got=repr(method))
     if optimizer is None:
         optimizer = "adam" if cascade else "lbfgs"
-    if optimizer not in ("lbfgs", "adam"):
-        raise invalid("optimizer", expected="'lbfgs' or 'adam'", got=repr(optimizer))
+    if optimizer not in ("lbfgs", "preconditioned", "adam"):
+        expected = "'lbfgs', 'preconditioned' or 'adam'"
+        raise invalid("optimizer", expected=expected, got=repr(optimizer))
     asked = restarts is not None
     if restarts is None:
         restarts = 8 if cascade else 6
@@ -181,7 +182,7 @@ def fit(
             argument,
             starts,
             optimizer=optimizer,
-            steps=climb or (500 if optimizer == "lbfgs" else 1500),
+            steps=climb or (1500 if optimizer == "adam" else 500),
             seed=seed,
             workers=workers,
             progress=progress,

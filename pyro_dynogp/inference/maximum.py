@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from scipy.optimize import minimize
 from torch import Tensor
 
 from pyro_dynogp.inference.checkpoints import (
@@ -24,7 +25,7 @@ from pyro_dynogp.inference.potential import Potential
 from pyro_dynogp.parallel import parallel_map, seeded
 from pyro_dynogp.record import Record, as_records
 
-Optimizer = Literal["lbfgs", "adam"]
+Optimizer = Literal["lbfgs", "preconditioned", "adam"]
 # Adam's first step, and how often it goes back to the best point with a shorter one.
 RATE, RETURNS = 0.02, 2
 # Starts that climb together, as long as they have no more samples than this in all: longer records
@@ -66,6 +67,27 @@ class _Task:
 
 
 def _lbfgs(
+    functions: Functions, z: np.ndarray, task: _Task, every: int
+) -> tuple[np.ndarray, list, str]:
+    del every  # of Hessians, of which it has none
+    history: list[float] = []
+
+    def function(x: np.ndarray) -> tuple[float, np.ndarray]:
+        values, gradients = functions(x[None])
+        return float(values[0]), gradients[0]
+
+    result = minimize(
+        function,
+        z,
+        jac=True,
+        method="L-BFGS-B",
+        callback=lambda intermediate_result: history.append(float(intermediate_result.fun)),
+        options={"maxiter": task.steps, "maxfun": 2 * task.steps, "maxcor": 20, "ftol": 1e-7},
+    )
+    return result.x, history, str(result.message)
+
+
+def _preconditioned(
     functions: Functions, z: np.ndarray, task: _Task, every: int
 ) -> tuple[np.ndarray, list, str]:
     return descend(functions, z, task.steps, every=every, first=0 if task.goes_on else None)
@@ -115,7 +137,7 @@ def _from(z: np.ndarray, rate: float, steps: int) -> tuple[Tensor, Any, Any]:
     return x, optimizer, torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps, eta_min=low)
 
 
-_METHODS = {"lbfgs": _lbfgs, "adam": _adam}
+_METHODS = {"lbfgs": _lbfgs, "preconditioned": _preconditioned, "adam": _adam}
 
 
 def _optimise(task: _Task) -> list[Optimum]:

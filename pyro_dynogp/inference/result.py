@@ -142,7 +142,10 @@ class Fit:
 
     @property
     def elbo(self) -> np.ndarray:
-        """Evidence lower bound after each step of SVI; for "map" log p(y, values) [nats]."""
+        """Evidence lower bound after each step of SVI; for "map" log p(y, values) [nats].
+
+        One value where Laplace's approximation was so close that SVI did not start.
+        """
         return self.history if self.method == "svi" else -self.history
 
     def at_mode(self) -> Fit:

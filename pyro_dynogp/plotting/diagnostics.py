@@ -204,6 +204,7 @@ def history(fit: Fit) -> Figure:
     noisy = fit.method == "svi"
     panel.plot(
         iteration, values, color=style.MODEL, linewidth=0.7 if noisy else 1.6,
+        marker="o" if len(values) == 1 else None,
         alpha=0.5 if noisy else 1.0, label="estimate" if noisy else None,
     )  # fmt: skip
     if noisy and len(values) >= 50:

@@ -86,7 +86,7 @@ def test_other_models_are_evaluated_point_by_point():
     np.testing.assert_allclose(gradients, [[1.0, 2.0], [0.0, 0.5]])
 
 
-@pytest.mark.parametrize("optimizer", ["lbfgs", "adam"])
+@pytest.mark.parametrize("optimizer", ["lbfgs", "preconditioned", "adam"])
 def test_starts_end_together_where_they_end_alone(optimizer):
     model = Linear(1, pairs=2).scaled_to(ONE)
     starts = starting_values(model, (ONE,), count=3, seed=0)
