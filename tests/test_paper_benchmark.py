@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import pyro_dynogp as dgp
+from tests.benchmarks import circumstances
 from tests.benchmarks.paper import bound, ours, run
 from tests.benchmarks.paper.experiments import CIRCUIT_VARIABLE, EXPERIMENTS
 from tests.benchmarks.paper.page import number, page, spread
@@ -152,6 +153,7 @@ def test_finished_jobs_are_not_run_again_and_failures_are_kept(tmp_path, monkeyp
 
     monkeypatch.setattr(run.subprocess, "run", process)
     monkeypatch.setattr(run, "KEPT", tmp_path / "rows.jsonl")
+    monkeypatch.setattr(circumstances, "reference_seconds", lambda: 2.0 * circumstances.USUAL)
     text = run.run(tmp_path, ["electricity"], ["dynoNet"])
     assert calls == [["electricity", "dynoNet", "0"]]
     assert "failed, stopped after" in text
@@ -159,7 +161,8 @@ def test_finished_jobs_are_not_run_again_and_failures_are_kept(tmp_path, monkeyp
     assert len(calls) == 1
     ((job, row),) = run.kept_rows(run.KEPT).items()
     assert job == ("electricity", "dynoNet", 0)
-    assert row["failed"] == "stopped after 3000 s"
+    limit = 2.0 * (run.GRACE * EXPERIMENTS["electricity"].seconds + 600.0)
+    assert row["failed"] == f"stopped after {limit:.0f} s"
 
 
 def test_rows_that_are_kept(tmp_path):

@@ -34,7 +34,7 @@ class Experiment:
         load: (seed) -> training record or records, test records by name, and their noise-free
             outputs where they are known.
         architecture, noisy, width: as `Task` has them.
-        seconds: budget of every method for learning, on one core.
+        seconds: budget of every method for learning, on one core of the usual machine.
         skip: first test samples that are not scored.
         follows: whether the test comes right after the training record.
         test_process_noise: whether the test period has any; False where the protocol says so.
@@ -200,7 +200,7 @@ EXPERIMENTS = {
     ),
     "electricity": Experiment(
         "electricity demand", _electricity, (5, "static", 5), (False, False),
-        seconds=600.0, seeds=(0,), width=3, unit="MW",
+        seconds=1800.0, seeds=(0,), width=3, unit="MW",
         targets={"rmse": 291.0, "mae": 215.0, "crps": 197.0},
         paper={"rmse": (291.0, 297.0, 376.0), "mae": (215.0, 235.0, 273.0),
                "crps": (197.0, np.nan, 258.0)},

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import pyro_dynogp as dgp
-from tests.benchmarks.circumstances import sentence
+from tests.benchmarks.circumstances import USUAL, sentence
 from tests.benchmarks.markdown import table
 from tests.benchmarks.paper.bound import System, clean_error_bound
 from tests.benchmarks.paper.experiments import EXPERIMENTS, Experiment
@@ -36,12 +36,13 @@ def page(rows: Sequence[Row], folder: Path, pictures: Path) -> str:
             of an experiment is drawn again where the predictions of all of its jobs are there.
     """
     parts = [
-        "Peers may learn for an experiment's budget of wall time, and stop before where they gain "
-        "no more; pyro_dynogp runs with its default settings, whatever time they take. Some "
-        "settings of the peers were chosen with a look at test scores of the second drives and of "
-        "two simulated systems, which is in their favour. Tests are free runs: no test output is "
-        "seen. A cell is the median over seeds, with the range in brackets; the CRPS of a point "
-        "prediction is its MAE."
+        "Peers may learn for an experiment's budget of wall time (longer by as much as the "
+        f"machine is slower than one that does ten million additions in {USUAL} s), and stop "
+        "before where they gain no more; pyro_dynogp runs with its default settings, whatever time "
+        "they take. Some settings of the peers were chosen with a look at test scores of the "
+        "second drives and of two simulated systems, which is in their favour. Tests are free "
+        "runs: no test output is seen. A cell is the median over seeds, with the range in "
+        "brackets; the CRPS of a point prediction is its MAE."
     ]
     for key, experiment in EXPERIMENTS.items():
         own = [row for row in rows if row["experiment"] == key]

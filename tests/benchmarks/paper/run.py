@@ -16,6 +16,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from tests.benchmarks.circumstances import budget
 from tests.benchmarks.kept_rows import append_row, read_rows
 from tests.benchmarks.paper.experiments import EXPERIMENTS
 from tests.benchmarks.paper.job import METHODS
@@ -102,7 +103,7 @@ def _one(base: Path, job: tuple[str, str, int]) -> None:
     experiment, method, seed = job
     file = file_of(base, job)
     command = [sys.executable, "-m", "tests.benchmarks.paper.job", experiment, method, str(seed)]
-    limit = GRACE * EXPERIMENTS[experiment].seconds + 600.0
+    limit = budget(GRACE * EXPERIMENTS[experiment].seconds + 600.0)
     problem: str | None = None
     try:
         done = subprocess.run(
