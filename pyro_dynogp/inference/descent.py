@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import OptimizeResult, minimize
 
 from pyro_dynogp.inference.lockstep import Functions
 
@@ -112,27 +112,34 @@ def piece(
 
     Returns the point, the energy there, and why it ended.
     """
+    if root is None:
+        result = lbfgs(functions, z, steps, history, maxfun=3 * steps, ftol=1e-10, gtol=0.0)
+        return result.x, float(result.fun), str(result.message)
 
-    def at(x: np.ndarray) -> np.ndarray:
-        return x if root is None else z + root @ x
+    def rounded(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        values, gradients = functions(z + x @ root.T)
+        return values, gradients @ root
+
+    start = np.zeros(len(z))
+    result = lbfgs(rounded, start, steps, history, maxfun=3 * steps, ftol=1e-10, gtol=flat)
+    ended = float(np.abs(result.jac).max()) <= flat
+    return z + root @ result.x, float(result.fun), "flat" if ended else str(result.message)
+
+
+def lbfgs(
+    functions: Functions, z: np.ndarray, steps: int, history: list[float], **options: float
+) -> OptimizeResult:
+    """Scipy's L-BFGS from z (d,) on; the energy after each iteration is added to the history."""
 
     def function(x: np.ndarray) -> tuple[float, np.ndarray]:
-        values, gradients = functions(at(x)[None])
-        return float(values[0]), gradients[0] if root is None else root.T @ gradients[0]
+        values, gradients = functions(x[None])
+        return float(values[0]), gradients[0]
 
-    result = minimize(
+    return minimize(
         function,
-        z if root is None else np.zeros(len(z)),
+        z,
         jac=True,
         method="L-BFGS-B",
         callback=lambda intermediate_result: history.append(float(intermediate_result.fun)),
-        options={
-            "maxiter": steps,
-            "maxfun": 3 * steps,
-            "maxcor": 20,
-            "ftol": 1e-10,
-            "gtol": 0.0 if root is None else flat,
-        },
+        options={"maxiter": steps, "maxcor": 20, **options},
     )
-    ended = root is not None and float(np.abs(result.jac).max()) <= flat
-    return at(result.x), float(result.fun), "flat" if ended else str(result.message)

@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from scipy.optimize import minimize
 from torch import Tensor
 
 from pyro_dynogp.inference.checkpoints import (
@@ -19,7 +18,7 @@ from pyro_dynogp.inference.checkpoints import (
     tensor_text,
     text_tensor,
 )
-from pyro_dynogp.inference.descent import descend
+from pyro_dynogp.inference.descent import descend, lbfgs
 from pyro_dynogp.inference.lockstep import Functions, in_lockstep
 from pyro_dynogp.inference.potential import Potential
 from pyro_dynogp.parallel import parallel_map, seeded
@@ -71,19 +70,7 @@ def _lbfgs(
 ) -> tuple[np.ndarray, list, str]:
     del every  # of Hessians, of which it has none
     history: list[float] = []
-
-    def function(x: np.ndarray) -> tuple[float, np.ndarray]:
-        values, gradients = functions(x[None])
-        return float(values[0]), gradients[0]
-
-    result = minimize(
-        function,
-        z,
-        jac=True,
-        method="L-BFGS-B",
-        callback=lambda intermediate_result: history.append(float(intermediate_result.fun)),
-        options={"maxiter": task.steps, "maxfun": 2 * task.steps, "maxcor": 20, "ftol": 1e-7},
-    )
+    result = lbfgs(functions, z, task.steps, history, maxfun=2 * task.steps, ftol=1e-7)
     return result.x, history, str(result.message)
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -195,19 +195,12 @@ def _range(
     ends = []
     for side in (-1.0, 1.0):
         bound = number.low if side < 0.0 else number.high
-        lowest, width, value = at(number.at), number.step, number.at
+        lowest, width = at(number.at), number.step
         for _ in range(DOUBLINGS):  # not deep in the tails to begin with
             if at(_within(number.at + side * width, bound, side)) < lowest + DEPTH:
                 break
             width *= 0.5
-        for _ in range(DOUBLINGS):
-            value = _within(number.at + side * width, bound, side)
-            here = at(value)
-            lowest = min(lowest, here)
-            if value == bound or here > lowest + DEPTH:
-                break
-            width *= 2.0
-        ends.append(value)
+        ends.append(_end(at, replace(number, step=width), side))
     return ends[0], ends[1]
 
 

@@ -48,6 +48,7 @@ def test_a_curved_ridge_is_followed_to_its_end():
     start[::2] = 1.2
     z, history, message = descend(functions, start, 400, every=LEAST)
     assert message == "nothing left to gain"
+    # What FLAT leaves, 0.0005 of height, is 0.04 along the valley of curvature 0.5.
     np.testing.assert_allclose(z, 1.0, atol=0.05)
     assert history[-1] < 10 * FLAT**2
 
@@ -84,6 +85,7 @@ def test_where_there_is_no_hessian_it_ends_at_its_best_point():
 def test_hessian_by_differences(seed, d):
     z = np.random.default_rng(seed).uniform(-1.5, 1.5, d)
     functions = functions_of(rosen, rosen_der)
+    # Third and fourth derivatives of up to 1e4 over a step of 1e-4, and rounding over it.
     np.testing.assert_allclose(hessian(functions, z), rosen_hess(z), rtol=1e-5, atol=1e-3)
     some = [d - 1, 0]
     part = rosen_hess(z)[np.ix_(some, some)]

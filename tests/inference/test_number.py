@@ -146,5 +146,6 @@ def test_all_peaks_of_a_comb_are_found(at, step):
     share = np.exp([float(comb([x]).log_joint(gain)) for x in fine])
     share /= share.sum()
     expected = share @ fine
+    # A tenth of the sd: no interval that was left holds more than a tenth of the mass.
     assert mean == pytest.approx(expected, abs=0.03)
     assert sd == pytest.approx(np.sqrt(share @ (fine - expected) ** 2), rel=0.05)
