@@ -25,15 +25,11 @@ from pyro_dynogp.discrepancy.extend import (
 from pyro_dynogp.discrepancy.gate import structure_left
 from pyro_dynogp.discrepancy.noise_effects import data_faults
 from pyro_dynogp.discrepancy.parameters import limits_of, parameters_of
+from pyro_dynogp.discrepancy.refits import poles_of, quick_fit
 from pyro_dynogp.discrepancy.report import Attempt, FoundEffect, Report
 from pyro_dynogp.discrepancy.residuals import residuals_of
 from pyro_dynogp.discrepancy.search import Found, candidates_of, look, merged
-from pyro_dynogp.discrepancy.trials import (
-    one_step_density,
-    poles_of,
-    quick_fit,
-    without,
-)
+from pyro_dynogp.discrepancy.trials import one_step_density, without
 from pyro_dynogp.inference.fit import fit as fit_model
 from pyro_dynogp.inference.result import Method
 from pyro_dynogp.models.cascade import Cascade
@@ -99,11 +95,11 @@ def close_loop(
     other = candidates if isinstance(candidates, Record) else None
     data = blocks_of(fit, record, other)
     names = _names(fit, data.known, candidates)
-    poles = poles_of(fit)
     training = without(data.known, data.held_out)
-    first = fit.at_mode()
-    if data.refit or isinstance(fit.model, Cascade):  # as far up as its extensions will get
-        first = quick_fit(fit.model, training, poles, seed, None if data.refit else first)
+    # As far up as its extensions will get: what a better climb gains is no effect.
+    first = quick_fit(
+        fit.model, training, seed, None if data.refit else fit.at_mode(), poles=poles_of(fit)
+    )
     current = first
     clock.next("fit of block A")
     state = _State(data, names, seed, level, tries, effects, workers, progress)
@@ -137,7 +133,7 @@ def close_loop(
             current = confirmed.fit
         else:
             training = without(data.known, state.held_out)
-            current = quick_fit(model, training, poles_of(current), seed, current)
+            current = quick_fit(model, training, seed, current)
         clock.next("refits")
     else:  # rounds are spent; whether something is left is still to be said
         residuals, found, _ = state.look(current, {one.effect.name for one, _ in accepted})
@@ -211,7 +207,7 @@ class _State:
         if plain != fit.model:
             structural = [e for e in effects if e.family in OF_INPUTS and e.score == "forecast"]
             training = without(self.data.known, self.held_out)
-            again = quick_fit(plain, training, poles_of(fit), self.seed, fit)
+            again = quick_fit(plain, training, self.seed, fit)
             others = self.residuals(again, self.data.known, self.held_out)
             found = merged(found, look(others, structural, **options)[0])
         return residuals, found, skipped

@@ -116,16 +116,21 @@ def candidates_of(
     An effect is a candidate if its own test rejects at the level, or nearly does while that of a
     relative does: one cause makes the tests of a family go off together (a delay looks like
     dynamics, a dead zone like play), and refits alone tell its members apart. Of several channels
-    that one effect may come from, those that reject are candidates.
+    that one effect may come from, those that reject are candidates, each with what the others
+    have not made of the model already.
     """
     families = {one.effect.family for one in found if one.evidence.p_value <= level}
     out: list[tuple[Found, tuple[Model, ...]]] = []
+    made: dict[str, set[str]] = {}
     for one in found:
         p = one.evidence.p_value
         relative = one.effect.family in families and p <= RELATIVE
         if (p > level and not relative) or len(out) >= tries:
             continue
-        variants = tuple(one.effect.extend(model, one.evidence, record))
+        known = made.setdefault(one.effect.name, set())
+        extended = one.effect.extend(model, one.evidence, record)
+        variants = tuple(variant for variant in extended if repr(variant) not in known)
         if variants:
             out.append((one, variants))
+            known.update(repr(variant) for variant in variants)
     return out

@@ -11,36 +11,18 @@ import numpy as np
 from scipy.special import logsumexp
 
 from pyro_dynogp.criticism.densities import pointwise_log_density
-from pyro_dynogp.discrepancy.extend import Model, has_function
-from pyro_dynogp.inference.cascade_fit import climb, grow, starting_points
-from pyro_dynogp.inference.checkpoints import NOTHING_KEPT
-from pyro_dynogp.inference.fit import at_optimum
-from pyro_dynogp.inference.maximum import Optimum, maximise
+from pyro_dynogp.discrepancy.extend import Model
+from pyro_dynogp.discrepancy.refits import energy, poles_of, quick_fit, race
 from pyro_dynogp.inference.result import Fit
-from pyro_dynogp.inference.starts import (
-    grown,
-    random_poles,
-    starting_values,
-    values_given_poles,
-)
 from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.collapsed import collapsed_of
-from pyro_dynogp.models.linear import LinearDynamicGP
 from pyro_dynogp.prediction.beginning import beginning
 from pyro_dynogp.prediction.linear import prior_process
 from pyro_dynogp.record import Record
 
-# Work spent on a refit: iterations and fresh starts beside the warm one, of linear models and of
-# cascades.
-LINEAR_STEPS, LINEAR_STARTS = 120, 2
-CASCADE_STEPS, CASCADE_STARTS = 300, 4
-# Iterations from what the base of a cascade has learnt.
-WARM_STEPS = 100
 # Blocks of a record on which effects of one instant are scored, every other one at a time.
 BLOCKS = 12
 Score = Literal["one step", "forecast"]
-# Starts that climb side by side: processors are kept busy by other trials.
-TOGETHER = 8
 # How often the best variant is refined.
 REFINEMENTS = 2
 
@@ -93,56 +75,52 @@ class Tried:
 def run(trial: Trial) -> Tried:
     """Refit the variants on the first fold's training data, the best on all; score the folds."""
     begin = time.perf_counter()
-    training = without(trial.record, trial.folds[0])
-    several = len(trial.models) > 1
-    poles = poles_of(trial.base)
-    problems: list[str] = []
-    fitted: list[Fit] = []
-
-    def look(models: Sequence[Model]) -> None:
-        for model in models:
-            try:
-                found = quick_fit(model, training, poles, trial.seed, trial.base, short=several)
-                fitted.append(found)
-            except ValueError as error:  # for instance a channel that is constant there
-                problems.append(str(error))
-
-    def best() -> Fit:
-        return min(fitted, key=lambda found: float(found.start_energies[0]))
-
-    def unscaled(found: Fit) -> Model:
-        return replace(found.model, scaling=None)
-
-    if trial.fit is not None:
-        fitted.append(trial.fit)
-    else:
-        look(trial.models)
-    if not fitted:
-        return Tried(trial.models[0], np.zeros(0), time.perf_counter() - begin, problems[0])
-    if trial.refine is not None and several:
-        for times in range(REFINEMENTS):
-            look(trial.refine(unscaled(best()), times))
-    model = unscaled(best())
-    parts, beside, first = [], [np.zeros(0)], best()
+    first: Fit | None = None
+    parts, beside = [np.zeros(0)], [np.zeros(0)]
+    failure = ""
     try:
+        first = _most_probable(trial, without(trial.record, trial.folds[0]))
         for index, fold in enumerate(trial.folds):
-            if index == 0:
-                if several:  # so far only to rank it
-                    first = quick_fit(model, training, poles, trial.seed, trial.base)
-                found = first
-            else:
+            found = first
+            if index > 0:
                 rest = without(trial.record, fold)
-                found = quick_fit(model, rest, poles, trial.seed, trial.base)
+                found = quick_fit(_unscaled(first), rest, trial.seed, trial.base)
             parts.append(held_out_density(found, trial.record, fold, trial.score))
             if trial.score == "one step":
                 beside.append(held_out_density(found, trial.record, fold, "forecast"))
     except ValueError as error:
-        problems.append(str(error))
-        parts = [np.zeros(0)]
-    seconds = time.perf_counter() - begin
-    failure = problems[-1] if not len(parts[0]) else ""
-    densities, forecasts = np.concatenate(parts), np.concatenate(beside)
-    return Tried(model, densities, seconds, failure, first, forecasts)
+        failure, parts = str(error), [np.zeros(0)]
+    return Tried(
+        trial.models[0] if first is None else _unscaled(first),
+        np.concatenate(parts),
+        time.perf_counter() - begin,
+        failure,
+        first,
+        np.concatenate(beside),
+    )
+
+
+def _most_probable(trial: Trial, training: Record) -> Fit:
+    """The variant that is most probable on the training data, at its mode."""
+    if trial.fit is not None:
+        return trial.fit
+    base = trial.base
+    (model, *others), start = trial.models, base
+    if others:
+        found, problems = race(trial.models, training, base, trial.seed)
+        if not found:
+            raise ValueError(problems[0])
+        start = found[0]
+        for times in range(REFINEMENTS):
+            finer = [] if trial.refine is None else trial.refine(_unscaled(start), times)
+            start = min([start, *race(finer, training, start, trial.seed)[0]], key=energy)
+        model = _unscaled(start)
+    return quick_fit(model, training, trial.seed, start, poles=poles_of(base))
+
+
+def _unscaled(fit: Fit) -> Model:
+    model: Model = replace(fit.model, scaling=None)
+    return model
 
 
 def without(record: Record, fold: np.ndarray) -> Record:
@@ -151,94 +129,6 @@ def without(record: Record, fold: np.ndarray) -> Record:
     y[fold] = np.nan
     there = np.flatnonzero(np.isfinite(y).any(1))
     return record.with_outputs(y)[: there[-1] + 1]
-
-
-def quick_fit(
-    model: Model,
-    record: Record,
-    poles: np.ndarray | None,
-    seed: int,
-    base: Fit | None = None,
-    *,
-    short: bool = False,
-) -> Fit:
-    """Posterior mode of a model, from few starts and from the fit of the model it extends.
-
-    Args:
-        model: the model. record: training record. poles: (P,) of a linear model [1/time unit].
-        seed: of fresh starts. base: fit of the model that it extends, where it may start.
-        short: fewer iterations, to rank variants.
-
-    Raises:
-        ValueError: where the record does not fit the model, or a channel is constant.
-    """
-    records = model.check(record)
-    scaled = replace(model, scaling=None).scaled_to(records)
-    if isinstance(scaled, Cascade):
-        optima = _cascade(scaled, records, seed, base, short)
-    else:
-        steps = LINEAR_STEPS // 3 if short else LINEAR_STEPS
-        optima = _linear(scaled, records, poles, seed, steps, base)
-    return at_optimum(scaled, optima, seed, records)
-
-
-def _linear(
-    model: LinearDynamicGP,
-    records: Sequence[Record],
-    poles: np.ndarray | None,
-    seed: int,
-    steps: int,
-    base: Fit | None,
-) -> list[Optimum]:
-    """Fresh starts, from the poles of the base, and from all that it has learnt."""
-    assert model.scaling is not None
-    starts = starting_values(model, records, count=LINEAR_STARTS, seed=seed)
-    if poles is not None:
-        generator = np.random.default_rng(seed)
-        more = model.pairs - len(poles)
-        for _ in range(1 if more <= 0 else 3):
-            kept = poles[: model.pairs]
-            if more > 0:
-                fresh = random_poles(more, model.scaling, generator)
-                kept = np.concatenate([kept, fresh])
-            starts.append(values_given_poles(model, records, model.scaling, kept)[1])
-    if base is not None and not isinstance(base.model, Cascade):
-        starts.append(grown(base.mode, starts[-1]))
-    return maximise(
-        model, records[0], starts, optimizer="preconditioned", steps=steps, seed=seed, workers=1,
-        together=TOGETHER,
-    )  # fmt: skip
-
-
-def _cascade(
-    model: Cascade, records: Sequence[Record], seed: int, base: Fit | None, short: bool
-) -> list[Optimum]:
-    """From what the base has learnt, where it has the same layers; else from fresh starts.
-
-    Without a function a cascade starts at its optimum but for the noise: one start is enough.
-    """
-    target, record = model.collapsed, records[0]
-    before = None if base is None else base.model
-    if base is None or not isinstance(before, Cascade) or len(before.layers) != len(model.layers):
-        count = CASCADE_STARTS if has_function(model) else 1
-        starts = starting_points(target, records, count, LINEAR_STEPS, seed, 1, False, NOTHING_KEPT)
-        return climb(
-            target, record, starts, [], optimizer="adam", steps=CASCADE_STEPS, seed=seed,
-            workers=1, together=TOGETHER,
-        )  # fmt: skip
-    linear = 5 if short else LINEAR_STEPS // 3
-    (start,) = starting_points(target, records, 1, linear, seed, 1, False, NOTHING_KEPT)
-    learnt = grown(base.mode, start, silent=True)
-    steps = WARM_STEPS // 3 if short else WARM_STEPS
-    return grow(target, record, learnt, start, steps=steps, seed=seed)
-
-
-def poles_of(fit: Fit) -> np.ndarray | None:
-    """Poles (P,) at the mode of a linear model [1/time unit]; None for a cascade."""
-    if isinstance(fit.model, Cascade):
-        return None
-    poles: np.ndarray = fit._system_at(fit.mode).modes.poles.numpy()
-    return poles
 
 
 def held_out_density(fit: Fit, record: Record, fold: np.ndarray, score: Score) -> np.ndarray:

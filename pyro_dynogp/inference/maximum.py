@@ -204,14 +204,17 @@ def maximise(
     kept: float = 1 / 3,
     rate: float = RATE,
     together: int = TOGETHER,
+    near: bool = False,
 ) -> list[Optimum]:
     """Climb from every start; the optima sorted by energy, best first.
 
     All starts get a fifth of the steps, then the best of them, the share `kept`, the rest
     (successive halving: a start that is far behind by then hardly ever wins). The mode is that of
     the density of the constrained values (no Jacobian), as AutoDelta has it. `rate` is Adam's
-    first step, in unconstrained units. Up to `together` starts climb side by side where evaluating
-    them at once pays; how many does not depend on the number of processors, nor does the result.
+    first step, in unconstrained units. Starts are `near` their optima where others have climbed
+    before: optimisers that make use of the curvature do so at once. Up to `together` starts climb
+    side by side where evaluating them at once pays; how many does not depend on the number of
+    processors, nor does the result.
     """
 
     def climb(values: Sequence[dict[str, Tensor]], count: int, label: str) -> list[Optimum]:
@@ -226,7 +229,7 @@ def maximise(
                 checkpoints,
                 f"{key}-{label}-{i}",
                 rate,
-                label == "optima",
+                near or label == "optima",
             )
             for i, batch in enumerate(_batches(values, model, records, together))
         ]

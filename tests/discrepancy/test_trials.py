@@ -12,7 +12,8 @@ from pyro_dynogp.channels import Recorded
 from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.discrepancy.confirm import ERRORS, NATS
 from pyro_dynogp.discrepancy.extend import with_channel, with_pairs, without_process_noise
-from pyro_dynogp.discrepancy.trials import held_out_density, quick_fit
+from pyro_dynogp.discrepancy.refits import quick_fit
+from pyro_dynogp.discrepancy.trials import held_out_density
 from pyro_dynogp.inference import cascade_fit
 from pyro_dynogp.inference.cascade_fit import grow, starting_points
 from pyro_dynogp.inference.checkpoints import NOTHING_KEPT
@@ -43,7 +44,7 @@ def base(record):
     model = dgp.Wiener(1, pairs=1, inducing=6)
     training = record[:TRAINING]
     fit = dgp.fit(model, training, method="map", restarts=1, steps=60, workers=1, progress=False)
-    return quick_fit(model, training, None, 0, fit)
+    return quick_fit(model, training, 0, fit)
 
 
 def log_likelihood(model, records, values):
@@ -70,7 +71,7 @@ def test_what_has_grown_starts_at_the_likelihood_of_its_base(record, base, more)
 def test_an_extended_cascade_explains_what_its_base_lacks(record, base):
     training, fold = record[:TRAINING], np.arange(N) >= TRAINING
     model = with_channel(replace(base.model, scaling=None), Recorded("w"))
-    fit = quick_fit(model, training, None, 0, base)
+    fit = quick_fit(model, training, 0, base)
     assert float(fit.start_energies[0]) < float(base.start_energies[0]) - 50.0
     gain = held_out_density(fit, record, fold, "forecast")
     gain = gain - held_out_density(base, record, fold, "forecast")
@@ -82,7 +83,7 @@ def test_an_extended_cascade_explains_what_its_base_lacks(record, base):
 
 
 def test_the_same_model_goes_on_from_where_it_is(record, base):
-    again = quick_fit(base.model, record[:TRAINING], None, 0, base)
+    again = quick_fit(base.model, record[:TRAINING], 0, base)
     assert float(again.start_energies[0]) <= float(base.start_energies[0]) + 1e-6
 
 

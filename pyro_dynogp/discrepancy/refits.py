@@ -1,0 +1,201 @@
+"""Posterior modes of extended models, from what the models that they extend have learnt."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pyro_dynogp.discrepancy.extend import Model, has_function
+from pyro_dynogp.inference.cascade_fit import climb, grow, starting_points
+from pyro_dynogp.inference.cascade_starts import Values
+from pyro_dynogp.inference.checkpoints import NOTHING_KEPT
+from pyro_dynogp.inference.fit import at_optimum
+from pyro_dynogp.inference.maximum import Optimum, maximise
+from pyro_dynogp.inference.result import Fit
+from pyro_dynogp.inference.starts import (
+    grown,
+    random_poles,
+    starting_values,
+    values_given_poles,
+)
+from pyro_dynogp.models.cascade import Cascade
+from pyro_dynogp.models.linear import LinearDynamicGP
+from pyro_dynogp.record import Record
+
+# Iterations and fresh starts beside the warm one, of linear models and of cascades.
+LINEAR_STEPS, LINEAR_STARTS = 120, 2
+CASCADE_STEPS, CASCADE_STARTS = 300, 4
+# Iterations from what the base of a cascade has learnt, and of linear models that fill its sites.
+WARM_STEPS, FILLING_STEPS = 100, 40
+# Starts that climb side by side, as processors are kept busy by other trials, and the share of them
+# that climbs to the end.
+TOGETHER, KEPT = 8, 1 / 2
+# Iterations of all variants of an effect, and more of the leading ones: this share, three at least.
+FIRST_STEPS, MORE_STEPS = 8, 32
+LEADING, FEWEST = 1 / 5, 3
+
+
+def quick_fit(
+    model: Model,
+    record: Record,
+    seed: int,
+    base: Fit | None = None,
+    *,
+    poles: np.ndarray | None = None,
+) -> Fit:
+    """Posterior mode of a model, from few starts and from the fit of the model it extends.
+
+    Args:
+        model: the model. record: training record. seed: of fresh starts.
+        base: fit of the model that it extends, where it may start.
+        poles: (P,) that a linear model may start from [1/time unit]; by default those of the base.
+
+    Raises:
+        ValueError: where the record does not fit the model, or a channel is constant.
+    """
+    scaled, records = _scaled(model, record)
+    if not isinstance(scaled, Cascade):
+        starts = starting_values(scaled, records, count=LINEAR_STARTS, seed=seed)
+        starts += _warm_starts(scaled, records, seed, base, poles)
+        optima = _linear(scaled, records, starts, LINEAR_STEPS, seed)
+    elif base is not None and _begins(scaled, base):
+        optima = _grown(scaled, records, seed, base, WARM_STEPS, FILLING_STEPS)
+    else:
+        optima = _fresh(scaled, records, seed)
+    return at_optimum(scaled, optima, seed, records)
+
+
+def race(
+    models: Sequence[Model], record: Record, base: Fit, seed: int
+) -> tuple[list[Fit], list[str]]:
+    """Variants of one effect, the most probable first, and why others could not be fitted.
+
+    All take a few steps from what the base has learnt, the leading ones more: a variant that is
+    far behind after the first (they differ by tens to hundreds of nats) hardly ever wins.
+
+    Args:
+        models: variants. record: training record. base: fit of the model that they extend.
+        seed: of what has no typical value.
+    """
+    found: list[Fit] = []
+    problems: list[str] = []
+    for model in models:
+        try:
+            found.append(_first(model, record, base, seed))
+        except ValueError as error:  # for instance a channel that is constant there
+            problems.append(str(error))
+    found.sort(key=energy)
+    cut = max(FEWEST, round(LEADING * len(found)))
+    leading = [_further(one, seed) if _begins(one.model, base) else one for one in found[:cut]]
+    return sorted([*leading, *found[cut:]], key=energy), problems
+
+
+def energy(fit: Fit) -> float:
+    """-log p(y, values) at the mode [nats]."""
+    return float(fit.start_energies[0])
+
+
+def poles_of(fit: Fit) -> np.ndarray | None:
+    """Poles (P,) at the mode of a linear model [1/time unit]; None for a cascade."""
+    if isinstance(fit.model, Cascade):
+        return None
+    poles: np.ndarray = fit._system_at(fit.mode).modes.poles.numpy()
+    return poles
+
+
+def _scaled(model: Model, record: Record) -> tuple[Model, tuple[Record, ...]]:
+    """The model in the units of a record, and the record with the model's channels."""
+    records = model.check(record)
+    return replace(model, scaling=None).scaled_to(records), records
+
+
+def _begins(model: Model, base: Fit) -> bool:
+    """Whether a model begins where its base is: linear ones do, cascades of the same layers."""
+    before = base.model
+    if isinstance(model, Cascade):
+        return isinstance(before, Cascade) and len(before.layers) == len(model.layers)
+    return not isinstance(before, Cascade)
+
+
+def _first(model: Model, record: Record, base: Fit, seed: int) -> Fit:
+    """A few steps from what the base has learnt; where nothing can be learnt from it, all."""
+    scaled, records = _scaled(model, record)
+    if not _begins(scaled, base):
+        return quick_fit(model, record, seed, base)
+    if isinstance(scaled, Cascade):
+        optima = _grown(scaled, records, seed, base, FIRST_STEPS, FIRST_STEPS // 3)
+    else:
+        starts = _warm_starts(scaled, records, seed, base)
+        optima = _linear(scaled, records, starts, FIRST_STEPS, seed)
+    return at_optimum(scaled, optima, seed, records)
+
+
+def _further(found: Fit, seed: int) -> Fit:
+    """More steps of a climb that has begun."""
+    optima = maximise(
+        found.model.collapsed, found.records[0], [dict(found.mode)], optimizer="preconditioned",
+        steps=MORE_STEPS, seed=seed, workers=1, near=True,
+    )  # fmt: skip
+    return at_optimum(found.model, optima, seed, found.records)
+
+
+def _linear(
+    model: LinearDynamicGP,
+    records: Sequence[Record],
+    starts: Sequence[Values],
+    steps: int,
+    seed: int,
+) -> list[Optimum]:
+    return maximise(
+        model, records[0], starts, optimizer="preconditioned", steps=steps, seed=seed, workers=1,
+        together=TOGETHER, kept=KEPT,
+    )  # fmt: skip
+
+
+def _warm_starts(
+    model: LinearDynamicGP,
+    records: Sequence[Record],
+    seed: int,
+    base: Fit | None,
+    poles: np.ndarray | None = None,
+) -> list[Values]:
+    """From the poles of the base, and from all that it has learnt."""
+    assert model.scaling is not None
+    starts: list[Values] = []
+    if poles is None and base is not None:
+        poles = poles_of(base)
+    if poles is not None:
+        generator = np.random.default_rng(seed)
+        more = model.pairs - len(poles)
+        for _ in range(1 if more <= 0 else 3):
+            kept = poles[: model.pairs]
+            if more > 0:
+                fresh = random_poles(more, model.scaling, generator)
+                kept = np.concatenate([kept, fresh])
+            starts.append(values_given_poles(model, records, model.scaling, kept)[1])
+    if base is not None and _begins(model, base):
+        starts.append(grown(base.mode, starts[-1]))
+    return starts
+
+
+def _fresh(model: Cascade, records: Sequence[Record], seed: int) -> list[Optimum]:
+    """Without a function a cascade starts at its optimum but for the noise: one start is enough."""
+    count = CASCADE_STARTS if has_function(model) else 1
+    target = model.collapsed
+    starts = starting_points(target, records, count, LINEAR_STEPS, seed, 1, False, NOTHING_KEPT)
+    return climb(
+        target, records[0], starts, [], optimizer="adam", steps=CASCADE_STEPS, seed=seed,
+        workers=1, together=TOGETHER,
+    )  # fmt: skip
+
+
+def _grown(
+    model: Cascade, records: Sequence[Record], seed: int, base: Fit, steps: int, filling: int
+) -> list[Optimum]:
+    """From what a cascade of the same layers has learnt; what it lacks is filled and silent."""
+    target = model.collapsed
+    (start,) = starting_points(target, records, 1, filling, seed, 1, False, NOTHING_KEPT)
+    learnt = grown(base.mode, start, silent=True)
+    return grow(target, records[0], learnt, start, steps=steps, seed=seed)

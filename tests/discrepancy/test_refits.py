@@ -1,0 +1,97 @@
+"""Variants of an effect race from what their base has learnt; which of them run."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import pyro_dynogp as dgp
+from pyro_dynogp.channels import Delayed, Recorded
+from pyro_dynogp.discrepancy import effects, refits
+from pyro_dynogp.discrepancy.extend import with_channel, without_process_noise
+from pyro_dynogp.discrepancy.refits import energy, quick_fit, race
+from pyro_dynogp.discrepancy.search import candidates_of
+from tests.discrepancy.made import coloured
+from tests.discrepancy.plant_dynamics import System, response
+from tests.discrepancy.test_confirm import spoken_for, two_inputs
+
+N, STEP, LATE = 300, 0.1, 5
+MODEL = dgp.LinearDynamicGP(1, pairs=1)
+
+
+@pytest.fixture(scope="module")
+def record():
+    """The output follows the input five samples late; a recorded channel never moves."""
+    rng = np.random.default_rng(5)
+    u = coloured(rng, N + LATE, 0.6)
+    system = System(np.array([-0.3 + 0.4j]), np.array([[0.3 - 0.2j]]))
+    y = response(system, u[:N, None])
+    y = y / y.std() + 0.05 * rng.standard_normal(N)
+    return dgp.Record(
+        STEP * np.arange(N), u[LATE:, None], y[:, None], input_names=("u",),
+        extra={"still": np.ones(N)},
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def base(record):
+    return quick_fit(MODEL, record, 0)
+
+
+def later(samples: float) -> dgp.LinearDynamicGP:
+    return with_channel(MODEL, Delayed("u", samples * STEP))
+
+
+def test_the_most_probable_variant_comes_first(record, base):
+    delays = (1, 2, 3, 4, 5, 6, 8, 11)
+    found, problems = race([later(d) for d in delays], record, base, 0)
+    assert not problems
+    assert len(found) == len(delays)
+    assert [energy(one) for one in found] == sorted(energy(one) for one in found)
+    assert replace(found[0].model, scaling=None) == later(LATE)
+    assert energy(found[0]) < energy(base) - 100.0
+    # To its end the winner's climb gains little, and no other variant would have come before it.
+    whole = {d: energy(quick_fit(later(d), record, 0, base)) for d in delays}
+    assert min(whole, key=lambda d: whole[d]) == LATE
+    assert energy(found[0]) - whole[LATE] < 4.0
+
+
+def test_those_behind_take_only_the_first_steps(record, base):
+    found, _ = race([later(d) for d in range(1, 9)], record, base, 0)
+    # Eight steps in all of a climb from several starts.
+    steps = sorted(len(one.history) for one in found)
+    behind = len(found) - refits.FEWEST
+    assert all(count <= refits.FIRST_STEPS for count in steps[:behind])
+    assert all(refits.FIRST_STEPS < count <= refits.MORE_STEPS for count in steps[behind:])
+
+
+def test_what_cannot_be_fitted_is_said(record, base):
+    still = with_channel(MODEL, Recorded("still"))
+    found, (problem,) = race([still, later(LATE)], record, base, 0)
+    assert len(found) == 1
+    assert "constant" in problem
+    assert race([], record, base, 0) == ([], [])
+
+
+def test_a_cascade_that_is_no_larger_goes_on_from_its_base(record):
+    model = dgp.Wiener(1, pairs=1, inducing=4, process_noise=False)
+    start = dgp.fit(model, record[:150], method="map", restarts=1, steps=30, workers=1,
+                    progress=False)  # fmt: skip
+    delayed = [with_channel(model, Delayed("u", d * STEP)) for d in (3, LATE)]
+    found, _ = race(delayed, record[:150], start, 0)
+    assert replace(found[0].model, scaling=None) == delayed[1]
+    assert energy(found[0]) < energy(start) - 50.0
+    assert without_process_noise(found[0].model) == found[0].model
+
+
+def test_a_variant_is_tried_for_one_channel_only():
+    data, model = two_inputs(), dgp.LinearDynamicGP(inputs=2, pairs=1)
+    first = spoken_for(effects.DeadTime(), 0.001, 0.01, channel="a", delay=7200.0)
+    second = spoken_for(effects.DeadTime(), 0.002, 0.01, channel="b", delay=9000.0)
+    (_, some), (_, others) = candidates_of([first, second], model, data, 0.05, 8)
+    assert others
+    assert len(others) < len(some)
+    assert not {repr(one) for one in some} & {repr(one) for one in others}
+    assert len(candidates_of([first, first], model, data, 0.05, 8)) == 1
