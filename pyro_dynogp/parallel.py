@@ -82,7 +82,7 @@ def parallel_map(
         bar.update()
 
     with bar:
-        if workers == 1 or len(items) == 1:
+        if workers == 1 or len(items) <= 1:
             for item in items:
                 advance(function(item))
             return results

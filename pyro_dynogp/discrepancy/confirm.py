@@ -23,6 +23,9 @@ ERRORS, NATS = 2.0, 4.0
 # Where densities are scored: after the training data, or on blocks spread over the whole record.
 Where = Literal["after", "spread"]
 Kind = tuple[Where, Score]
+# An effect that the residual speaks for, and variants of the model with it.
+Candidate = tuple[Found, tuple[Model, ...]]
+STRUCTURE_FIRST = "what certainly lies between inputs and output comes first"
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +65,7 @@ class _Judged:
 
 
 def confirm(
-    candidates: Sequence[tuple[Found, tuple[Model, ...]]],
+    candidates: Sequence[Candidate],
     current: Fit,
     record: Record,
     held_out: np.ndarray,
@@ -74,6 +77,8 @@ def confirm(
     progress: bool = False,
 ) -> Confirmed:
     """Add each candidate alone, refit, and compare the densities of what was held out.
+
+    What goes with the noise is tried where no structure is certain: its lack looks like noise.
 
     Args:
         candidates: from `candidates_of`. current: fit of the model that is extended, to what is not
@@ -99,20 +104,32 @@ def confirm(
         )  # fmt: skip
         return dict(zip(tasks, done, strict=True))
 
-    kinds: list[Kind] = [
-        ("spread", "forecast") if f.effect.localised else ("after", f.effect.score)
-        for f, _ in candidates
+    results: dict[Any, Tried] = {}
+
+    def judged_of(some: Sequence[Candidate]) -> list[_Judged]:
+        # Two effects may be the same block of the model: it is fitted once.
+        tasks = {("", kind): trial((model,), kind, None) for kind in map(_kind, some)}
+        for found, variants in some:
+            kind = _kind((found, variants))
+            tasks[repr(variants), kind] = trial(variants, kind, found)
+        results.update(fitted(tasks, "refits"))
+        return [
+            _judge(one[0], kind, results[repr(one[1]), kind], results["", kind], number)
+            for one in some
+            for kind in [_kind(one)]
+        ]
+
+    judged = judged_of([one for one in candidates if _kind(one)[1] == "forecast"])
+    waiting = [one for one in candidates if _kind(one)[1] != "forecast"]
+    if not any(one.helps and one.found.q_value <= level for one in judged):
+        places = {id(found): place for place, (found, _) in enumerate(candidates)}
+        judged = sorted([*judged, *judged_of(waiting)], key=lambda one: places[id(one.found)])
+        waiting = []
+    untried = [
+        Attempt(number, found.evidence, found.q_value, "not tried", STRUCTURE_FIRST)
+        for found, _ in waiting
     ]
-    # Two effects may be the same block of the model: it is fitted once.
-    tasks = {("", kind): trial((model,), kind, None) for kind in kinds}
-    for (found, variants), kind in zip(candidates, kinds, strict=True):
-        tasks[repr(variants), kind] = trial(variants, kind, found)
-    results = fitted(tasks, "refits")
-    judged = [
-        _judge(found, kind, results[repr(variants), kind], results["", kind], number)
-        for (found, variants), kind in zip(candidates, kinds, strict=True)
-    ]
-    attempts = [one.attempt for one in judged]
+    attempts = [*(one.attempt for one in judged), *untried]
     better = _first_in_line([one for one in judged if one.helps], level)
     if not better:
         return Confirmed(tuple(attempts), None, model, None, None, None, ())
@@ -151,7 +168,7 @@ def confirm(
             new = one.attempt
         decided.append(new)
     return Confirmed(
-        attempts=tuple(decided),
+        attempts=(*decided, *untried),
         winner=winner.found,
         before=model,
         model=winner.tried.model,
@@ -159,6 +176,11 @@ def confirm(
         fit=winner.tried.fit if winner.kind[0] == "after" else None,
         ties=tuple(one for one in names if one != name),
     )
+
+
+def _kind(candidate: Candidate) -> Kind:
+    effect = candidate[0].effect
+    return ("spread", "forecast") if effect.localised else ("after", effect.score)
 
 
 def _judge(found: Found, kind: Kind, tried: Tried, base: Tried, number: int) -> _Judged:

@@ -144,6 +144,24 @@ def test_the_fit_of_the_winner_is_handed_on() -> None:
     assert len(done.fit.records[0]) == 240  # to what is not held out
 
 
+@pytest.mark.parametrize(("q", "decision"), [(1e-8, "not tried"), (0.5, "rejected")])
+def test_noise_is_tried_where_no_structure_is_certain(q: float, decision: str) -> None:
+    record = machine(weight=0.3)
+    fit = fitted(record)
+    where = {"channel": "heat", "form": "linear", "delay": 0.0}
+    both = [
+        spoken_for(effects.HeavyTails(), 0.01, 0.5, degrees_of_freedom=6.0),
+        spoken_for(effects.ExtraInput(), 1e-9, q, **where),
+    ]
+    model = replace(fit.model, scaling=None)
+    tasks = [(one, tuple(one.effect.extend(model, one.evidence, record))) for one in both]
+    held_out = np.arange(360) >= 240
+    done = confirm(tasks, fit, record[:360], held_out, number=1, seed=0, level=0.05, workers=1)
+    assert done.winner is both[1]
+    decisions = {one.evidence.effect: one.decision for one in done.attempts}
+    assert decisions == {"extra input": "accepted", "heavy tails": decision}
+
+
 def two_inputs() -> dgp.Record:
     rng = np.random.default_rng(0)
     u = rng.standard_normal((300, 2))
