@@ -233,17 +233,25 @@ def _distance_function(form: str, lengthscale: Tensor, x1: Tensor, x2: Tensor | 
     inverse = lengthscale.reciprocal().unsqueeze(-2)
     # Differences, not |x|^2 - 2 x'y + |y|^2: near points would lose their distance to rounding.
     difference = (x1 * inverse).unsqueeze(-2) - (x2 * inverse).unsqueeze(-3)
-    square = difference.square().sum(-1)
+    # Where nothing is differentiated memory is used again: of many draws it is what this costs.
+    end = "" if difference.requires_grad else "_"
+
+    def then(x: Tensor, operation: str, *args: float | Tensor) -> Tensor:
+        found: Tensor = getattr(x, operation + end)(*args)
+        return found
+
+    square = then(difference, "square")
+    square = square.squeeze(-1) if square.shape[-1] == 1 else square.sum(-1)
     if form == "rbf":
-        return (-0.5 * square).exp()
-    r = (square + TINY).sqrt()
+        return then(then(square, "mul", -0.5), "exp")
+    a = then(then(square, "add", TINY), "sqrt")
     if form == "matern12":
-        return (-r).exp()
+        return then(then(a, "neg"), "exp")
+    a = then(a, "mul", math.sqrt(3.0 if form == "matern32" else 5.0))
+    decay = then(a.neg(), "exp")
     if form == "matern32":
-        a = math.sqrt(3.0) * r
-        return (1.0 + a) * (-a).exp()
-    a = math.sqrt(5.0) * r
-    return (1.0 + a + a.square() / 3.0) * (-a).exp()
+        return then(then(a, "add", 1.0), "mul", decay)
+    return then(a.square() / 3.0 + a + 1.0, "mul", decay)
 
 
 @lru_cache
