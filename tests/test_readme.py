@@ -15,8 +15,10 @@ from tests.conftest import simulate_record
 README = (Path(__file__).parent.parent / "README.md").read_text()
 
 
-def blocks() -> list[str]:
-    return re.findall(r"```python\n(.*?)```", README, flags=re.S)
+def block(content: str) -> str:
+    """The one block of Python with this in it."""
+    (found,) = (b for b in re.findall(r"```python\n(.*?)```", README, flags=re.S) if content in b)
+    return str(found)
 
 
 def test_fitting_a_record(tmp_path, monkeypatch, one_pair):
@@ -29,7 +31,7 @@ def test_fitting_a_record(tmp_path, monkeypatch, one_pair):
         comments="",
         delimiter=",",
     )
-    code = blocks()[0].replace("pairs=5", "pairs=1")
+    code = block("from_csv").replace("pairs=5", "pairs=1")
     code = code.replace("train)", "train, restarts=1, workers=1, progress=False)", 1)
     code = code.replace('"svi")', '"svi", restarts=1, steps=50, workers=1, progress=False)')
     names: dict = {}
@@ -41,7 +43,7 @@ def test_fitting_a_record(tmp_path, monkeypatch, one_pair):
 
 def test_a_deep_model_is_fitted(tmp_path, monkeypatch, one_pair):
     monkeypatch.chdir(tmp_path)
-    code = blocks()[1].replace("pairs=3", "pairs=1, outputs=2").replace("outputs=2, pairs", "pairs")
+    code = block("dgp.Cascade(").replace("pairs=3", "pairs=1, outputs=2").replace("outputs=2, pairs", "pairs")
     code = code.replace('skip=("inputs",)', 'pairs=1, skip=("inputs",)')
     quick = "restarts=1, steps=3, particles=1, workers=1, progress=False"
     code = code.replace('checkpoint="run1"', f'checkpoint="run1", {quick}')
@@ -66,7 +68,7 @@ def test_a_fit_is_criticised(one_pair):
             dgp.Wiener(1, pairs=1, inducing=6), train, restarts=1, steps=20, draws=50, **quick
         ),
     }
-    code = blocks()[2]
+    code = block("dgp.check(")
     for target in ("missing sample", "forecast"):
         fast = f'target="{target}", draws=100, refits=0, workers=1, progress=False'
         code = code.replace(f'target="{target}"', fast)
@@ -93,13 +95,13 @@ def test_any_pyro_model_is_criticised(one_pair):
         for _ in range(20):
             svi.step(record)
         names: dict = {"dgp": dgp, "model": model, "guide": guide, "record": record}
-        exec(blocks()[3], names)
+        exec(block("from_pyro"), names)
     assert names["posterior"].draws.log_q is not None
 
 
 def test_custom_model_trains(one_pair):
     names: dict = {}
-    exec(next(block for block in blocks() if "def model(record)" in block), names)
+    exec(block("def model(record)"), names)
     model, record = names["model"], simulate_record(one_pair, 0.1, n=60)
     pyro.set_rng_seed(0)
     with pyro.get_param_store().scope():
