@@ -43,7 +43,11 @@ def test_fitting_a_record(tmp_path, monkeypatch, one_pair):
 
 def test_a_deep_model_is_fitted(tmp_path, monkeypatch, one_pair):
     monkeypatch.chdir(tmp_path)
-    code = block("dgp.Cascade(").replace("pairs=3", "pairs=1, outputs=2").replace("outputs=2, pairs", "pairs")
+    code = (
+        block("dgp.Cascade(")
+        .replace("pairs=3", "pairs=1, outputs=2")
+        .replace("outputs=2, pairs", "pairs")
+    )
     code = code.replace('skip=("inputs",)', 'pairs=1, skip=("inputs",)')
     quick = "restarts=1, steps=3, particles=1, workers=1, progress=False"
     code = code.replace('checkpoint="run1"', f'checkpoint="run1", {quick}')

@@ -12,13 +12,13 @@ from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.discrepancy.extend import Model
 from pyro_dynogp.discrepancy.report import Attempt
 from pyro_dynogp.discrepancy.search import Found
-from pyro_dynogp.discrepancy.trials import Score, Trial, Tried, interleaved, run
+from pyro_dynogp.discrepancy.trials import NATS, Score, Trial, Tried, interleaved, run
 from pyro_dynogp.inference.result import Fit
 from pyro_dynogp.parallel import parallel_map
 from pyro_dynogp.record import Record
 
 # A gain counts if it is more than so many block standard errors, and than so many nats.
-ERRORS, NATS = 2.0, 4.0
+ERRORS = 2.0
 
 # Where densities are scored: after the training data, or on blocks spread over the whole record.
 Where = Literal["after", "spread"]
@@ -94,8 +94,10 @@ def confirm(
     def trial(models: tuple[Model, ...], kind: Kind, found: Found | None) -> Trial:
         where, score = kind
         known = current if found is None and where == "after" else None
-        refine = None if found is None else found.effect.refine
-        return Trial(models, record, folds[where], current, seed, score, refine, known)
+        plain = Trial(models, record, folds[where], current, seed, score, fit=known)
+        if found is None:
+            return plain
+        return replace(plain, refine=found.effect.refine, compared=found.effect.compared)
 
     def fitted(tasks: dict[Any, Trial], label: str) -> dict[Any, Tried]:
         done = parallel_map(

@@ -23,6 +23,10 @@ from pyro_dynogp.record import Record
 # Blocks of a record on which effects of one instant are scored, every other one at a time.
 BLOCKS = 12
 Score = Literal["one step", "forecast"]
+# Data on which variants of an effect are compared.
+Compared = Literal["training", "held out"]
+# Differences of held-out log-densities that count are larger [nats].
+NATS = 4.0
 # How often the best variant is refined.
 REFINEMENTS = 2
 
@@ -39,6 +43,7 @@ class Trial:
         base: fit of the model that is extended, to start from.
         seed: of fresh starts.
         score: what densities are of, see `held_out_density`.
+        compared: on which data variants are, see `Effect`.
         fit: of a single model to the first fold's training data, where there is one already.
     """
 
@@ -49,6 +54,7 @@ class Trial:
     seed: int
     score: Score = "one step"
     refine: Callable[[Model, int], Sequence[Model]] | None = None
+    compared: Compared = "training"
     fit: Fit | None = None
 
 
@@ -79,7 +85,7 @@ def run(trial: Trial) -> Tried:
     parts, beside = [np.zeros(0)], [np.zeros(0)]
     failure = ""
     try:
-        first = _most_probable(trial, without(trial.record, trial.folds[0]))
+        first = _kept(trial, without(trial.record, trial.folds[0]))
         for index, fold in enumerate(trial.folds):
             found = first
             if index > 0:
@@ -100,10 +106,12 @@ def run(trial: Trial) -> Tried:
     )
 
 
-def _most_probable(trial: Trial, training: Record) -> Fit:
-    """The variant that is most probable on the training data, at its mode."""
+def _kept(trial: Trial, training: Record) -> Fit:
+    """The variant that is kept, fitted to the training data."""
     if trial.fit is not None:
         return trial.fit
+    if len(trial.models) > 1 and trial.compared == "held out":
+        return _best_ahead(trial, training)
     base = trial.base
     (model, *others), start = trial.models, base
     if others:
@@ -116,6 +124,13 @@ def _most_probable(trial: Trial, training: Record) -> Fit:
             start = min([start, *race(finer, training, start, trial.seed)[0]], key=energy)
         model = _unscaled(start)
     return quick_fit(model, training, trial.seed, start, poles=poles_of(base))
+
+
+def _best_ahead(trial: Trial, training: Record) -> Fit:
+    """The first variant that does as well as the best on the data held out."""
+    fits = [quick_fit(model, training, trial.seed, trial.base) for model in trial.models]
+    sums = [held_out_density(f, trial.record, trial.folds[0], trial.score).sum() for f in fits]
+    return next(f for f, total in zip(fits, sums, strict=True) if total >= max(sums) - NATS)
 
 
 def _unscaled(fit: Fit) -> Model:

@@ -126,6 +126,24 @@ def test_a_step_is_added_wherever_it_is(instant: int) -> None:
     assert mean == pytest.approx(0.3, abs=4.0 * sd + 0.01)
 
 
+@pytest.mark.parametrize("bends", [False, True])
+def test_a_drift_goes_on_as_held_out_data_say(bends: bool) -> None:
+    record = machine()
+    t = np.linspace(0.0, 1.0, len(record))
+    shape = 1.0 - np.exp(-t / 0.3) if bends else t
+    record = record.with_outputs(record.outputs + shape[:, None])
+    report = dgp.close_loop(
+        fitted(record), record, effects=(effects.Drift(),), max_rounds=1, workers=1, progress=False
+    )
+    assert [one.name for one in report.effects] == ["drift"]
+    model = report.fit.model
+    assert (model.pairs == 2) is bends  # a random path
+    assert bool(model.channels) is not bends  # a line
+    # The noise's own is 0.05. What is left of the bend is small; a line would go on to 0.26.
+    assert report.after["rmse"] < (0.1 if bends else 0.06)
+    assert report.before["rmse"] > 3.0 * report.after["rmse"]
+
+
 def test_the_fit_of_the_winner_is_handed_on() -> None:
     record = machine(weight=0.3)
     fit = fitted(record)

@@ -11,7 +11,7 @@ import numpy as np
 from pyro_dynogp.channels.base import signal_of
 from pyro_dynogp.discrepancy.evidence import Evidence, Residuals
 from pyro_dynogp.discrepancy.extend import Model
-from pyro_dynogp.discrepancy.trials import Score
+from pyro_dynogp.discrepancy.trials import Compared, Score
 from pyro_dynogp.record import Record
 
 # Share of its estimate by which a limit or a width may be off, tried by refits, and then finer.
@@ -28,6 +28,8 @@ class Effect:
         localised: whether it happens at one instant, so that refits are scored on blocks of the
             whole record rather than after it.
         score: on which densities it must pay: of forecasts, or one step ahead.
+        compared: on which data its variants are: those that are fitted to, or, where variants
+            differ in how they go on, those held out (the first that does as well as the best).
         once: whether it is not looked for again in a model that has it.
         added: whether a block mends it; False for what is only reported.
         test: finds evidence in residuals; a class whose test needs more overrides `detect`.
@@ -38,6 +40,7 @@ class Effect:
     freedom: ClassVar[int] = 1
     localised: ClassVar[bool] = False
     score: ClassVar[Score] = "forecast"
+    compared: ClassVar[Compared] = "training"
     once: ClassVar[bool] = False
     added: ClassVar[bool] = True
     test: ClassVar[Callable[..., Evidence | Sequence[Evidence]]]

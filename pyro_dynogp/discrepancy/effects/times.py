@@ -13,7 +13,7 @@ from pyro_dynogp.channels.clock import DAY
 from pyro_dynogp.discrepancy.calendar_effects import calendar
 from pyro_dynogp.discrepancy.clock_effects import clock_shift
 from pyro_dynogp.discrepancy.effects.base import Effect, centre_of, listed, number_of
-from pyro_dynogp.discrepancy.evidence import Curve, Evidence, Residuals
+from pyro_dynogp.discrepancy.evidence import Evidence, Residuals
 from pyro_dynogp.discrepancy.extend import (
     Model,
     with_channel,
@@ -35,8 +35,6 @@ CALENDAR_PARTS = {
     "hour of day by weekday/weekend": "hour of day by weekend",
     "season": "time of year",
 }
-# Share of a drift's variance from which it counts as a straight line.
-STRAIGHT = 0.95
 
 
 class Drift(Effect):
@@ -44,19 +42,19 @@ class Drift(Effect):
 
     name = "drift"
     family = "time"
+    compared = "held out"
     test = staticmethod(drift)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
-        """A straight line in time or, where it bends, a random path; or each input times a line.
+        """A straight line in time, or a random path; or each input times a line.
 
-        The random path is a pair of poles, as slow as suits it, that process noise drives: a line
-        through a bend would go on to where nothing is.
+        The random path is a pair of poles, as slow as suits it, that process noise drives. What is
+        nearly straight so far need not go on so: held-out data say whether it does.
         """
         begin, end = float(record.time[0]), float(record.time[-1])
         if evidence.where["form"] == "additive":
-            if evidence.curve is not None and _straightness(evidence.curve) < STRAIGHT:
-                return [with_process_noise(with_pairs(model, 1))]
-            return [with_channel(model, Trend(begin, end))]
+            path = with_process_noise(with_pairs(model, 1))
+            return [with_channel(model, Trend(begin, end)), path]
         extended = model
         prepared = model.check(record)[0]
         driving = prepared.n_inputs - model.direct
@@ -65,15 +63,6 @@ class Drift(Effect):
                 extended, TrendOfGain(name, centre_of(prepared, name), begin, end)
             )
         return [extended]
-
-
-def _straightness(curve: Curve) -> float:
-    """Share of a curve's variance that a straight line has."""
-    there = np.isfinite(curve.x) & np.isfinite(curve.fitted)
-    x, y = curve.x[there], curve.fitted[there]
-    if len(x) < 3 or not np.std(y) or not np.std(x):
-        return 1.0
-    return float(np.corrcoef(x, y)[0, 1] ** 2)
 
 
 class LevelShift(Effect):
