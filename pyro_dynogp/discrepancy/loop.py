@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 # Families of effects that go with inputs.
 OF_INPUTS = ("paths", "shapes")
 # Fresh starts of the last fits, of linear models and of cascades.
-LINEAR_STARTS, CASCADE_STARTS = 2, 1
+LAST_LINEAR_STARTS, LAST_CASCADE_STARTS = 2, 1
 SCORES = ("rmse", "mae", "nrmse", "crps", "coverage_50", "coverage_95")
 
 
@@ -291,7 +291,7 @@ def _final(fits: Sequence[Fit], record: Record, workers: int | None, progress: b
     def one(given: Fit) -> Fit:
         model = replace(given.model, scaling=None)
         method: Method = "svi" if has_function(model) or given.method != "map" else "map"
-        restarts = CASCADE_STARTS if isinstance(model, Cascade) else LINEAR_STARTS
+        restarts = LAST_CASCADE_STARTS if isinstance(model, Cascade) else LAST_LINEAR_STARTS
         return fit_model(
             model, record, method=method, start=given, restarts=restarts, seed=given.seed,
             workers=1, progress=False,
