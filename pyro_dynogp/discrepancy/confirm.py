@@ -11,7 +11,7 @@ import numpy as np
 from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.discrepancy.extend import Model
 from pyro_dynogp.discrepancy.report import Attempt
-from pyro_dynogp.discrepancy.search import Found
+from pyro_dynogp.discrepancy.search import Candidate, Found
 from pyro_dynogp.discrepancy.trials import NATS, Score, Trial, Tried, interleaved, run
 from pyro_dynogp.inference.result import Fit
 from pyro_dynogp.parallel import parallel_map
@@ -23,8 +23,6 @@ ERRORS = 2.0
 # Where densities are scored: after the training data, or on blocks spread over the whole record.
 Where = Literal["after", "spread"]
 Kind = tuple[Where, Score]
-# An effect that the residual speaks for, and variants of the model with it.
-Candidate = tuple[Found, tuple[Model, ...]]
 STRUCTURE_FIRST = "what certainly lies between inputs and output comes first"
 
 
@@ -110,19 +108,18 @@ def confirm(
 
     def judged_of(some: Sequence[Candidate]) -> list[_Judged]:
         # Two effects may be the same block of the model: it is fitted once.
-        tasks = {("", kind): trial((model,), kind, None) for kind in map(_kind, some)}
-        for found, variants in some:
-            kind = _kind((found, variants))
+        kinds = [_kind(found) for found, _ in some]
+        tasks = {("", kind): trial((model,), kind, None) for kind in kinds}
+        for (found, variants), kind in zip(some, kinds, strict=True):
             tasks[repr(variants), kind] = trial(variants, kind, found)
         results.update(fitted(tasks, "refits"))
         return [
-            _judge(one[0], kind, results[repr(one[1]), kind], results["", kind], number)
-            for one in some
-            for kind in [_kind(one)]
+            _judge(found, kind, results[repr(variants), kind], results["", kind], number)
+            for (found, variants), kind in zip(some, kinds, strict=True)
         ]
 
-    judged = judged_of([one for one in candidates if _kind(one)[1] == "forecast"])
-    waiting = [one for one in candidates if _kind(one)[1] != "forecast"]
+    judged = judged_of([one for one in candidates if _kind(one[0])[1] == "forecast"])
+    waiting = [one for one in candidates if _kind(one[0])[1] != "forecast"]
     if not any(one.helps and one.found.q_value <= level for one in judged):
         places = {id(found): place for place, (found, _) in enumerate(candidates)}
         judged = sorted([*judged, *judged_of(waiting)], key=lambda one: places[id(one.found)])
@@ -180,8 +177,9 @@ def confirm(
     )
 
 
-def _kind(candidate: Candidate) -> Kind:
-    effect = candidate[0].effect
+def _kind(found: Found) -> Kind:
+    """Where an effect is scored, and on which densities."""
+    effect = found.effect
     return ("spread", "forecast") if effect.localised else ("after", effect.score)
 
 

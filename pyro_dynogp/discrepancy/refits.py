@@ -121,9 +121,9 @@ def _begins(model: Model, base: Fit) -> bool:
 
 def _first(model: Model, record: Record, base: Fit, seed: int) -> Fit:
     """A few steps from what the base has learnt; where nothing can be learnt from it, all."""
-    scaled, records = _scaled(model, record)
-    if not _begins(scaled, base):
+    if not _begins(model, base):
         return quick_fit(model, record, seed, base)
+    scaled, records = _scaled(model, record)
     if isinstance(scaled, Cascade):
         optima = _grown(scaled, records, seed, base, FIRST_STEPS, FIRST_STEPS // 3)
     else:

@@ -26,6 +26,10 @@ class Found:
     q_value: float
 
 
+# An effect that the residual speaks for, and variants of the model with it.
+Candidate = tuple[Found, tuple[Model, ...]]
+
+
 @dataclass(frozen=True)
 class _Look:
     effect: Effect
@@ -110,7 +114,7 @@ def false_discovery_rates(p_values: np.ndarray) -> np.ndarray:
 
 def candidates_of(
     found: Sequence[Found], model: Model, record: Record, level: float, tries: int
-) -> list[tuple[Found, tuple[Model, ...]]]:
+) -> list[Candidate]:
     """The most probable effects that can be added, best first.
 
     An effect is a candidate if its own test rejects at the level, or nearly does while that of a
@@ -120,7 +124,7 @@ def candidates_of(
     have not made of the model already.
     """
     families = {one.effect.family for one in found if one.evidence.p_value <= level}
-    out: list[tuple[Found, tuple[Model, ...]]] = []
+    out: list[Candidate] = []
     made: dict[str, set[str]] = {}
     for one in found:
         p = one.evidence.p_value

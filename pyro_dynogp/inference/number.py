@@ -111,17 +111,15 @@ def _alone(energy: Callable[[float], float], number: Number) -> tuple[float, flo
     count = int(np.clip(SCANNED * (high - low) / number.step, *SCAN))
     at = np.unique(np.append(np.linspace(low, high, count), number.at))
     known = {float(x): energy(float(x)) for x in sorted(at, key=lambda x: abs(x - number.at))}
-    while len(known) < MOST:
+    while True:
         x = np.array(sorted(known))
         E = _capped(np.array([known[float(one)] for one in x]))
         new = _peak(x, E)
         if new is None:
             new = _midpoint(x, E)
-        if new is None:
+        if new is None or len(known) >= MOST:
             break
         known[new] = energy(new)
-    x = np.array(sorted(known))
-    E = _capped(np.array([known[float(one)] for one in x]))
     fine = np.unique(np.concatenate([np.linspace(a, b, 20) for a, b in itertools.pairwise(x)]))
     density = np.exp(E.min() - PchipInterpolator(x, E)(fine))
     share = density * np.gradient(fine)

@@ -183,6 +183,7 @@ def test_forecasts_with_refits_against_fits_to_the_past(linear, short):
         weights, k = arviz_bridge.psis(other.draws.log_ratio)[:2]
         if k < 0.5:
             exact = float(logsumexp(weights + density))
+            # Monte Carlo errors of 250 weighted draws on either side.
             assert float(found.loo_i[i - 30]) == pytest.approx(exact, abs=0.15)
             compared += 1
     assert compared >= 2

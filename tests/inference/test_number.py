@@ -148,4 +148,5 @@ def test_all_peaks_of_a_comb_are_found(at, step):
     expected = share @ fine
     # A tenth of the sd: no interval that was left holds more than a tenth of the mass.
     assert mean == pytest.approx(expected, abs=0.03)
+    # A twentieth: what interpolation between such points may misplace.
     assert sd == pytest.approx(np.sqrt(share @ (fine - expected) ** 2), rel=0.05)
