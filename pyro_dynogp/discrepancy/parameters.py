@@ -16,7 +16,7 @@ from pyro_dynogp.inference.number import Number, number_posterior
 from pyro_dynogp.inference.potential import Potential
 from pyro_dynogp.lti.views import steady_state_gain
 from pyro_dynogp.models.cascade import Cascade
-from pyro_dynogp.models.layers import Static
+from pyro_dynogp.models.layers import Dynamic, Static
 from pyro_dynogp.models.linear import LinearDynamicGP
 from pyro_dynogp.record import Record
 
@@ -130,7 +130,12 @@ def _numbers(fit: Fit, group: Sequence[Channel], record: Record) -> Parameters:
     whole = prepared(record, fit.model.channels)
     fields = list(first.numbers)
     numbers = [
-        Number(getattr(first, field), _step(first, quantity, whole), quantity.low)
+        Number(
+            getattr(first, field),
+            _step(first, quantity, whole),
+            quantity.low,
+            cell=_cell(fit.model, first, whole),
+        )
         for field, quantity in first.numbers.items()
     ]
 
@@ -160,6 +165,27 @@ def _step(channel: Channel, quantity: Quantity, record: Record) -> float:
     if quantity.unit == "time":
         return float(record.sampling_time)
     return 0.01 * float(np.std(channel.columns(record)))
+
+
+def _cell(
+    model: LinearDynamicGP | Cascade, channel: Channel, record: Record
+) -> tuple[float, float] | None:
+    """What times a whole number of samples stands for, of a dead time on an even clock.
+
+    What arrives between two samples acts as what arrives with the second, through another numerator
+    (Franklin, Powell & Workman, Digital Control of Dynamic Systems, 3rd ed., section 4.3): where
+    the numerator has a direct term to spare, all that can be told is in which step it arrives.
+    Without one, half a step to either side is what poles make up for.
+    """
+    if not (isinstance(channel, Delayed) and record.is_regular):
+        return None
+    step = record.sampling_time
+    if isinstance(model, Cascade):
+        first = next((one for one in model.layers if isinstance(one, Dynamic)), None)
+        at_once = first is None or first.feedthrough
+    else:
+        at_once = model.feedthrough
+    return (-step, 0.0) if at_once or channel.direct else (-0.5 * step, 0.5 * step)
 
 
 def _unit(channel: Channel, quantity: Quantity, record: Record) -> str:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+import torch
 
 from pyro_dynogp.discrepancy.extend import Model, has_function
 from pyro_dynogp.inference.cascade_fit import climb, grow, starting_points
 from pyro_dynogp.inference.cascade_starts import Values
 from pyro_dynogp.inference.checkpoints import NOTHING_KEPT
+from pyro_dynogp.inference.descent import descend
 from pyro_dynogp.inference.fit import at_optimum
+from pyro_dynogp.inference.lockstep import Functions
 from pyro_dynogp.inference.maximum import Optimum, maximise
+from pyro_dynogp.inference.potential import Potential
 from pyro_dynogp.inference.result import Fit
 from pyro_dynogp.inference.starts import (
     grown,
@@ -20,6 +24,7 @@ from pyro_dynogp.inference.starts import (
     starting_values,
     values_given_poles,
 )
+from pyro_dynogp.inference.versions import each_in_lockstep
 from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.linear import LinearDynamicGP
 from pyro_dynogp.record import Record
@@ -35,6 +40,10 @@ TOGETHER, KEPT = 8, 1 / 2
 # Iterations of all variants of an effect, and more of the leading ones: this share, three at least.
 FIRST_STEPS, MORE_STEPS = 8, 32
 LEADING, FEWEST = 1 / 5, 3
+
+
+# A linear model in the units of its records, and where it may start.
+_Beginning = tuple[Model, tuple[Record, ...], list[Values]]
 
 
 def quick_fit(
@@ -81,15 +90,30 @@ def race(
     """
     found: list[Fit] = []
     problems: list[str] = []
+    beginnings: list[_Beginning] = []
     for model in models:
         try:
-            found.append(_first(model, record, base, seed))
+            if not _begins(model, base):
+                found.append(quick_fit(model, record, seed, base))
+                continue
+            scaled, records = _scaled(model, record)
+            if isinstance(scaled, Cascade):
+                optima = _grown(scaled, records, seed, base, FIRST_STEPS, FIRST_STEPS // 3)
+                found.append(at_optimum(scaled, optima, seed, records))
+            else:
+                beginnings.append((scaled, records, _warm_starts(scaled, records, seed, base)))
         except ValueError as error:  # for instance a channel that is constant there
             problems.append(str(error))
-    found.sort(key=energy)
+    found = sorted([*found, *_side_by_side(beginnings, FIRST_STEPS, seed)], key=energy)
     cut = max(FEWEST, round(LEADING * len(found)))
-    leading = [_further(one, seed) if _begins(one.model, base) else one for one in found[:cut]]
-    return sorted([*leading, *found[cut:]], key=energy), problems
+    begun = [one for one in found[:cut] if _begins(one.model, base)]
+    rest = [one for one in found if not any(one is other for other in begun)]
+    if isinstance(base.model, Cascade):
+        begun = [_further(one, seed) for one in begun]
+    else:
+        more = [(one.model, one.records, [dict(one.mode)]) for one in begun]
+        begun = _side_by_side(more, MORE_STEPS, seed)
+    return sorted([*begun, *rest], key=energy), problems
 
 
 def energy(fit: Fit) -> float:
@@ -119,21 +143,39 @@ def _begins(model: Model, base: Fit) -> bool:
     return not isinstance(before, Cascade)
 
 
-def _first(model: Model, record: Record, base: Fit, seed: int) -> Fit:
-    """A few steps from what the base has learnt; where nothing can be learnt from it, all."""
-    if not _begins(model, base):
-        return quick_fit(model, record, seed, base)
-    scaled, records = _scaled(model, record)
-    if isinstance(scaled, Cascade):
-        optima = _grown(scaled, records, seed, base, FIRST_STEPS, FIRST_STEPS // 3)
-    else:
-        starts = _warm_starts(scaled, records, seed, base)
-        optima = _linear(scaled, records, starts, FIRST_STEPS, seed)
-    return at_optimum(scaled, optima, seed, records)
+def _side_by_side(beginnings: Sequence[_Beginning], steps: int, seed: int) -> list[Fit]:
+    """Fits of linear models, each from the most probable of its starts, some steps on.
+
+    Variants that differ in their inputs only (a delay, a limit, which channel) go through the model
+    together at each step.
+    """
+    potentials = [
+        Potential(model, (records[0],), starts[0]) for model, records, starts in beginnings
+    ]
+
+    def run(potential: Potential, starts: Sequence[Values]) -> Callable[[Functions], Optimum]:
+        z = np.stack([potential.pack(one).numpy() for one in starts])
+
+        def climb(functions: Functions) -> Optimum:
+            best = z[functions(z)[0].argmin()]
+            end, history, message = descend(
+                functions, best, steps, every=potential.hessian_cost, first=0
+            )
+            values = {k: v.detach() for k, v in potential.unpack(torch.tensor(end)).items()}
+            return Optimum(float(functions(end[None])[0][0]), values, np.asarray(history), message)
+
+        return climb
+
+    runs = [run(one, starts) for one, (_, _, starts) in zip(potentials, beginnings, strict=True)]
+    optima = each_in_lockstep(potentials, runs, jacobian=False)
+    return [
+        at_optimum(model, [optimum], seed, records)
+        for optimum, (model, records, _) in zip(optima, beginnings, strict=True)
+    ]
 
 
 def _further(found: Fit, seed: int) -> Fit:
-    """More steps of a climb that has begun."""
+    """More steps of a cascade's climb that has begun."""
     optima = maximise(
         found.model.collapsed, found.records[0], [dict(found.mode)], optimizer="preconditioned",
         steps=MORE_STEPS, seed=seed, workers=1, near=True,

@@ -39,7 +39,8 @@ class Trial:
         models: variants, of which the one most probable on the training data is kept.
         record: without the block that nobody has seen.
         folds: (n,) True where a fold is scored; it is trained on the rest.
-        refine: makes finer variants of the best one, given how many times it did so; none for none.
+        refine: makes finer variants of the best one, given the training data and how many times it
+            did so; none for none.
         base: fit of the model that is extended, to start from.
         seed: of fresh starts.
         score: what densities are of, see `held_out_density`.
@@ -53,7 +54,7 @@ class Trial:
     base: Fit
     seed: int
     score: Score = "one step"
-    refine: Callable[[Model, int], Sequence[Model]] | None = None
+    refine: Callable[[Model, Record, int], Sequence[Model]] | None = None
     compared: Compared = "training"
     fit: Fit | None = None
 
@@ -120,7 +121,9 @@ def _kept(trial: Trial, training: Record) -> Fit:
             raise ValueError(problems[0])
         start = found[0]
         for times in range(REFINEMENTS):
-            finer = [] if trial.refine is None else trial.refine(_unscaled(start), times)
+            finer: Sequence[Model] = []
+            if trial.refine is not None:
+                finer = trial.refine(_unscaled(start), training, times)
             start = min([start, *race(finer, training, start, trial.seed)[0]], key=energy)
         model = _unscaled(start)
     return quick_fit(model, training, trial.seed, start, poles=poles_of(base))

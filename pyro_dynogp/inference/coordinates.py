@@ -62,10 +62,12 @@ class StraightPotential(Potential):
         """Coordinates (*s, d) to constrained values (*s, *shape) of every site."""
         return super().unpack(self._unconstrained(x)[0])
 
-    def energy(self, x: Tensor, *, jacobian: bool) -> Tensor:
-        """-log density at x (d,): of the values, or with `jacobian` of the coordinates."""
-        z, log_det = self._unconstrained(x)
-        energy = super().energy(z, jacobian=jacobian)
+    def energy(
+        self, z: Tensor, *, jacobian: bool, inputs: Sequence[Tensor] | None = None
+    ) -> Tensor:
+        """-log density at z (d,): of the values, or with `jacobian` of the coordinates."""
+        plain, log_det = self._unconstrained(z)
+        energy = super().energy(plain, jacobian=jacobian, inputs=inputs)
         return energy - log_det if jacobian else energy
 
     def _unconstrained(self, x: Tensor) -> tuple[Tensor, Tensor]:

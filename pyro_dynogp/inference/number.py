@@ -15,13 +15,15 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from pyro_dynogp.inference.descent import bounded_root, piece
+from pyro_dynogp.inference.lockstep import Functions
 from pyro_dynogp.inference.potential import WALL, Potential
+from pyro_dynogp.inference.versions import each_in_lockstep
 
 # Nats below the top at which the density counts as zero; how often a range is doubled or halved to
 # find that depth; points of the grid for each of two numbers.
@@ -29,6 +31,8 @@ DEPTH, DOUBLINGS, POINTS = 9.0, 20, 9
 # Points for one number: for each step of the first scan, of all of it at least and at most, and in
 # all.
 SCANNED, SCAN, MOST = 8, (17, 33), 80
+# Cells beyond those that are known that are looked into at once.
+CELLS = 3
 # Peaks are looked for up to so many nats below the top, and a point goes where it promises so many;
 # so much of the mass is too much between two points.
 RISE, NEWS, SHARE = 60.0, 0.3, 0.1
@@ -38,6 +42,9 @@ ITERATIONS = 30
 FLAT = 0.05
 # Standard deviation of an unconstrained site in whose direction the density is flat.
 WIDEST = 3.0
+# Negative log densities, up to a constant, of several values of the number or numbers; infinite
+# where they cannot be evaluated. Several at once cost little more than one.
+Energies = Callable[[Sequence[tuple[float, ...]]], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -47,12 +54,15 @@ class Number:
     Attributes:
         at: its value in the fit. step: how far off it may easily be, to begin with.
         low, high: its bounds.
+        cell: (a, b), a <= 0 <= b, where data tell only whole multiples v of b - a apart: each
+            stands for all values from v + a to v + b.
     """
 
     at: float
     step: float
     low: float = -np.inf
     high: float = np.inf
+    cell: tuple[float, float] | None = None
 
 
 def number_posterior(
@@ -74,24 +84,30 @@ def number_posterior(
     root = bounded_root(first.hessian(z), widest=WIDEST)
     known: dict[tuple[float, ...], tuple[float, np.ndarray]] = {}
 
-    def energy(values: Sequence[float]) -> float:
-        """-log density up to a constant; infinite where it cannot be evaluated."""
-        key = tuple(values)
-        if key not in known:
-            near = min(known, key=lambda one: float(np.sum(((key - np.array(one)) / steps) ** 2)),
-                       default=None)  # fmt: skip
+    def energies(many: Sequence[tuple[float, ...]]) -> np.ndarray:
+        tasks: dict[tuple[float, ...], tuple[Potential, np.ndarray]] = {}
+        for values in many:
+            if values in known or values in tasks:
+                continue
+            near = _nearest(values, list(known), steps)
             start = z if near is None else known[near][1]
             try:
-                known[key] = _lowest(potential(key), start, root)
+                tasks[values] = potential(values), start
             except ValueError:  # numbers that make no model, as limits that cross: no density
-                known[key] = np.inf, start
-        return known[key][0]
+                known[values] = np.inf, start
+        known.update(zip(tasks, _lowest(list(tasks.values()), root), strict=True))
+        return np.array([known[values][0] for values in many])
 
+    energies([centre])  # where all others start
     if len(numbers) == 1:
-        return [_alone(lambda value: energy([value]), numbers[0])]
-    ranges = [_range(energy, centre, k, one) for k, one in enumerate(numbers)]
+        (number,) = numbers
+        found_by = _alone if number.cell is None else _in_cells
+        return [found_by(lambda values: energies([(one,) for one in values]), number)]
+    ranges = [_range(energies, centre, k, one) for k, one in enumerate(numbers)]
     grid = [np.linspace(low, high, POINTS) for low, high in ranges]
-    heights = np.array([energy(values) for values in itertools.product(*grid)])
+    # Every other point of the grid first: the rest start beside them.
+    energies(list(itertools.product(*(one[::2] for one in grid))))
+    heights = energies(list(itertools.product(*grid)))
     density = np.exp(heights.min() - heights).reshape([POINTS] * len(grid))
     found = []
     for axis, one in enumerate(grid):
@@ -100,30 +116,66 @@ def number_posterior(
     return found
 
 
-def _alone(energy: Callable[[float], float], number: Number) -> tuple[float, float]:
+def _nearest(
+    values: tuple[float, ...], others: Sequence[tuple[float, ...]], steps: np.ndarray
+) -> tuple[float, ...] | None:
+    """The nearest of other values, in steps; None where there are none."""
+    if not others:
+        return None
+    far = np.square((np.array(others) - values) / steps).sum(1)
+    return others[int(far.argmin())]
+
+
+def _alone(
+    energies: Callable[[Sequence[float]], np.ndarray], number: Number
+) -> tuple[float, float]:
     """Posterior mean and standard deviation of one number, whose density may have many peaks.
 
     Points go where peaks may be, half a step apart or more, then where mass is. A dead time is an
     example: neighbouring numbers of samples explain a record nearly as well, and times between them
     do not.
     """
-    low, high = (_end(energy, number, side) for side in (-1.0, 1.0))
+    low, high = _ends(energies, number, (number.step, number.step))
     count = int(np.clip(SCANNED * (high - low) / number.step, *SCAN))
-    at = np.unique(np.append(np.linspace(low, high, count), number.at))
-    known = {float(x): energy(float(x)) for x in sorted(at, key=lambda x: abs(x - number.at))}
-    while True:
+    scan: list[float] = np.linspace(low, high, count).tolist()
+    known: dict[float, float] = {}
+    new = [number.at, *scan[::2]]
+    while new:
+        known |= dict(zip(new, energies(new).tolist(), strict=True))
+        missing = [one for one in scan if one not in known]
         x = np.array(sorted(known))
-        E = _capped(np.array([known[float(one)] for one in x]))
-        new = _peak(x, E)
-        if new is None:
-            new = _midpoint(x, E)
-        if new is None or len(known) >= MOST:
-            break
-        known[new] = energy(new)
+        E = _capped(np.array([known[one] for one in x.tolist()]))
+        new = (missing or _peaks(x, E) or _midpoints(x, E))[: max(MOST - len(known), 0)]
     fine = np.unique(np.concatenate([np.linspace(a, b, 20) for a, b in itertools.pairwise(x)]))
     density = np.exp(E.min() - PchipInterpolator(x, E)(fine))
     share = density * np.gradient(fine)
     return _moments(fine, share / share.sum())
+
+
+def _in_cells(
+    energies: Callable[[Sequence[float]], np.ndarray], number: Number
+) -> tuple[float, float]:
+    """Posterior mean and standard deviation of a number of which data tell multiples only."""
+    assert number.cell is not None
+    a, b = number.cell
+    wide = b - a
+    known: dict[int, float] = {}
+    new = [round(number.at / wide)]
+    while new:
+        known |= dict(zip(new, energies([k * wide for k in new]).tolist(), strict=True))
+        top, new = min(known.values()), []
+        for side in (-1, 1):
+            outer = sorted(known, key=lambda k: side * k)[-CELLS:]
+            if min(known[k] for k in outer) < top + DEPTH and len(known) < MOST:
+                beyond = [outer[-1] + side * i for i in range(1, CELLS + 1)]
+                new += [k for k in beyond if number.low <= k * wide <= number.high]
+    at = np.array(sorted(known))
+    share = np.exp(top - np.array([known[k] for k in at.tolist()]))
+    share /= share.sum()
+    low, high = np.maximum(at * wide + a, number.low), np.minimum(at * wide + b, number.high)
+    middle = 0.5 * (low + high)
+    mean = float(share @ middle)
+    return mean, float(np.sqrt(share @ ((middle - mean) ** 2 + (high - low) ** 2 / 12.0)))
 
 
 def _capped(E: np.ndarray) -> np.ndarray:
@@ -131,8 +183,9 @@ def _capped(E: np.ndarray) -> np.ndarray:
     return np.asarray(np.minimum(E, E.min() + RISE))
 
 
-def _peak(x: np.ndarray, E: np.ndarray) -> float | None:
-    """Where a parabola through a low point and its neighbours says that a peak with mass is."""
+def _peaks(x: np.ndarray, E: np.ndarray) -> list[float]:
+    """Where parabolas through low points and their neighbours say that peaks with mass are."""
+    found = []
     for i in 1 + np.flatnonzero((E[1:-1] <= E[:-2]) & (E[1:-1] <= E[2:])):
         left, right = x[i] - x[i - 1], x[i + 1] - x[i]
         up, down = (E[i + 1] - E[i]) / right, (E[i - 1] - E[i]) / left
@@ -141,34 +194,42 @@ def _peak(x: np.ndarray, E: np.ndarray) -> float | None:
             continue
         slope = (up * left - down * right) / (left + right)
         lower = slope**2 / (4.0 * curvature)  # than the point
-        place = x[i] - slope / (2.0 * curvature)
         if lower > NEWS and E[i] - lower < E.min() + DEPTH:
-            return float(place)
-    return None
+            found.append(float(x[i] - slope / (2.0 * curvature)))
+    return found
 
 
-def _midpoint(x: np.ndarray, E: np.ndarray) -> float | None:
-    """Middle of the interval that may hold most, where that is much."""
+def _midpoints(x: np.ndarray, E: np.ndarray) -> list[float]:
+    """Middles of the intervals that may hold much, those that may hold most first."""
     density = np.exp(E.min() - E)
     wide = np.diff(x)
     most = wide * np.maximum(density[1:], density[:-1])
     total = float((0.5 * wide * (density[1:] + density[:-1])).sum())
-    i = int(most.argmax())
-    return float(0.5 * (x[i] + x[i + 1])) if most[i] > SHARE * total else None
+    order = np.argsort(-most, kind="stable")
+    return [float(0.5 * (x[i] + x[i + 1])) for i in order if most[i] > SHARE * total]
 
 
-def _end(energy: Callable[[float], float], number: Number, side: float) -> float:
-    """A value on one side beyond which the density is zero, a step away at least."""
-    bound = number.low if side < 0.0 else number.high
-    lowest, width = energy(number.at), number.step
+def _ends(
+    energies: Callable[[Sequence[float]], np.ndarray],
+    number: Number,
+    widths: tuple[float, float],
+) -> tuple[float, float]:
+    """Values on both sides beyond which the density is zero, these widths away at least."""
+    sides, bounds = (-1.0, 1.0), (number.low, number.high)
+    ends, width, there = [number.at, number.at], list(widths), [False, False]
+    lowest = float(energies([number.at])[0])
     for _ in range(DOUBLINGS):
-        value = _within(number.at + side * width, bound, side)
-        here = energy(value)
-        lowest = min(lowest, here)
-        if value == bound or here > lowest + DEPTH:
+        going = [k for k in (0, 1) if not there[k]]
+        for k in going:
+            ends[k] = _within(number.at + sides[k] * width[k], bounds[k], sides[k])
+        here = energies([ends[k] for k in going])
+        lowest = min(lowest, float(here.min()))
+        for k, height in zip(going, here, strict=True):
+            there[k] = ends[k] == bounds[k] or bool(height > lowest + DEPTH)
+            width[k] *= 2.0
+        if all(there):
             break
-        width *= 2.0
-    return value
+    return ends[0], ends[1]
 
 
 def _moments(x: np.ndarray, share: np.ndarray) -> tuple[float, float]:
@@ -176,30 +237,38 @@ def _moments(x: np.ndarray, share: np.ndarray) -> tuple[float, float]:
     return mean, float(np.sqrt(share @ (x - mean) ** 2))
 
 
-def _lowest(potential: Potential, z: np.ndarray, root: np.ndarray) -> tuple[float, np.ndarray]:
-    """Lowest energy from a point on, to a few hundredths of a nat, and where it is."""
-    z, energy, _ = piece(potential.with_jacobian, z, root, ITERATIONS, [], flat=FLAT)
-    return (energy if energy < WALL else np.inf), z
+def _lowest(
+    tasks: Sequence[tuple[Potential, np.ndarray]], root: np.ndarray
+) -> list[tuple[float, np.ndarray]]:
+    """Lowest energies from points on, to a few hundredths of a nat, and where they are."""
+
+    def run(start: np.ndarray) -> Callable[[Functions], tuple[np.ndarray, float, str]]:
+        return lambda own: piece(own, start, root, ITERATIONS, [], flat=FLAT)
+
+    found = each_in_lockstep(
+        [one for one, _ in tasks], [run(start) for _, start in tasks], jacobian=True
+    )
+    return [(energy if energy < WALL else np.inf, z) for z, energy, _ in found]
 
 
 def _range(
-    energy: Callable[[Sequence[float]], float], centre: Sequence[float], k: int, number: Number
+    energies: Energies, centre: tuple[float, ...], k: int, number: Number
 ) -> tuple[float, float]:
     """Between which values of a number the density is not zero, others held where they are."""
 
-    def at(value: float) -> float:
-        return energy([value if j == k else v for j, v in enumerate(centre)])
+    def at(values: Sequence[float]) -> np.ndarray:
+        return energies([(*centre[:k], value, *centre[k + 1 :]) for value in values])
 
-    ends = []
-    for side in (-1.0, 1.0):
-        bound = number.low if side < 0.0 else number.high
-        lowest, width = at(number.at), number.step
+    widths = []
+    lowest = float(at([number.at])[0])
+    for side, bound in ((-1.0, number.low), (1.0, number.high)):
+        width = number.step
         for _ in range(DOUBLINGS):  # not deep in the tails to begin with
-            if at(_within(number.at + side * width, bound, side)) < lowest + DEPTH:
+            if at([_within(number.at + side * width, bound, side)])[0] < lowest + DEPTH:
                 break
             width *= 0.5
-        ends.append(_end(at, replace(number, step=width), side))
-    return ends[0], ends[1]
+        widths.append(width)
+    return _ends(at, number, (widths[0], widths[1]))
 
 
 def _within(value: float, bound: float, side: float) -> float:

@@ -95,20 +95,24 @@ def _scored(model: Callable[..., Any], args: tuple[Any, ...], values: Mapping[st
     return trace
 
 
-def each_with_gradient(energy: Callable[[Tensor], Tensor], z: Tensor) -> tuple[Tensor, Tensor]:
+def each_with_gradient(
+    energy: Callable[..., Tensor], z: Tensor, *more: Tensor
+) -> tuple[Tensor, Tensor]:
     """Energies (k,) at z (k, d) and their gradients (k, d), infinite and zero where there are none.
 
-    Where one point breaks the evaluation of all, it is found by halving.
+    Where one point breaks the evaluation of all, it is found by halving. The energy is called with
+    z and with `more` (k, ...), a row for each point.
     """
     x = z.detach().requires_grad_()
     try:
         with torch.enable_grad(), pyro.validation_enabled(False), denormals_flushed():
-            value = energy(x)
+            value = energy(x, *more)
             (gradient,) = torch.autograd.grad(value.sum(), x)
     except (NotPositiveDefiniteError, torch.linalg.LinAlgError, ValueError):
         if len(z) == 1:
             return torch.full((1,), torch.inf, dtype=torch.float64), torch.zeros_like(z)
-        halves = [each_with_gradient(energy, half) for half in z.tensor_split(2)]
+        split = zip(*(one.tensor_split(2) for one in (z, *more)), strict=True)
+        halves = [each_with_gradient(energy, *half) for half in split]
         return torch.cat([v for v, _ in halves]), torch.cat([g for _, g in halves])
     bad = ~(torch.isfinite(value) & torch.isfinite(gradient).all(-1))
     return value.detach().masked_fill(bad, torch.inf), gradient.masked_fill(bad[:, None], 0.0)
@@ -203,12 +207,16 @@ class Potential:
         """Log p(y, values), of constrained values."""
         return _scored(self.model, self.args, values).log_prob_sum()
 
-    def energy(self, z: Tensor, *, jacobian: bool) -> Tensor:
+    def energy(
+        self, z: Tensor, *, jacobian: bool, inputs: Sequence[Tensor] | None = None
+    ) -> Tensor:
         """-log density at z (d,) or, of a model that takes batches, (k,) at z (k, d).
 
-        Of the values, or with `jacobian` of the unconstrained vector.
+        Of the values, or with `jacobian` of the unconstrained vector. With `inputs`, for each
+        record (k, n, n_u) or (n, n_u), each point has inputs of its own.
         """
-        return joint_energy(self.model, self.args, self.sites, z, jacobian=jacobian)
+        args = self.args if inputs is None else (*self.args, inputs)
+        return joint_energy(self.model, args, self.sites, z, jacobian=jacobian)
 
     def value_and_gradient(
         self, z: np.ndarray, *, jacobian: bool = False
@@ -222,20 +230,23 @@ class Potential:
         return float(values[0]), gradients[0]
 
     def values_and_gradients(
-        self, z: np.ndarray, *, jacobian: bool = False
+        self, z: np.ndarray, *, jacobian: bool = False, inputs: Sequence[Tensor] | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Energies (k,) and their gradients (k, d) at z (k, d), as `value_and_gradient` has them.
 
-        A model that takes batches is evaluated at `width` points at once.
+        A model that takes batches is evaluated at `width` points at once. `inputs` as of `energy`.
         """
 
-        def energy(x: Tensor) -> Tensor:
-            if len(x) == 1:
-                return self.energy(x[0], jacobian=jacobian)[None]
-            return self.energy(x, jacobian=jacobian)
+        def energy(x: Tensor, *u: Tensor) -> Tensor:
+            one = len(x) == 1
+            given = [each[0] if one else each for each in u] or None
+            if one:
+                return self.energy(x[0], jacobian=jacobian, inputs=given)[None]
+            return self.energy(x, jacobian=jacobian, inputs=given)
 
-        parts_of = torch.tensor(z, dtype=torch.float64).split(self.width)
-        found = [each_with_gradient(energy, part) for part in parts_of]
+        points = torch.tensor(z, dtype=torch.float64)
+        batches = zip(*(one.split(self.width) for one in (points, *(inputs or ()))), strict=True)
+        found = [each_with_gradient(energy, *batch) for batch in batches]
         values = torch.cat([value for value, _ in found]).numpy()
         values[np.isinf(values)] = WALL
         return values, torch.cat([gradient for _, gradient in found]).numpy()

@@ -343,8 +343,10 @@ class Cascade:
         residual = pyro.sample(f"{one.name}_residual", dist.Normal(0.0 * one_, one_).to_event(2))
         return StaticSystem(function, support_points(function.locations, layer.support), residual)
 
-    def __call__(self, records: Record | Sequence[Record]) -> None:
-        """Run the Pyro model on one record or on several."""
+    def __call__(
+        self, records: Record | Sequence[Record], inputs: Sequence[Tensor] | None = None
+    ) -> None:
+        """Run the Pyro model on one record or on several; `inputs` as of `LinearDynamicGP`."""
         checked = self.check(records)
         scaling = self.scaling or Scaling.from_records(checked)
         system = self.sample_system(scaling)
@@ -352,12 +354,13 @@ class Cascade:
             suffix = "" if len(checked) == 1 else f"_{index}"
             states = self.sample_states(suffix)
             here = self.begin(system, states)
+            u = scaled_inputs(scaling, record, None if inputs is None else inputs[index])
             if self.integrate == "all":
                 from pyro_dynogp.models.collapsed import observe_collapsed
 
-                observe_collapsed(here, scaling, record, suffix)
+                observe_collapsed(here, scaling, record, suffix, u)
             else:
-                self._observe(here, scaling, record, suffix)
+                self._observe(here, scaling, record, suffix, u)
 
     def sample_states(self, suffix: str) -> dict[str, Tensor]:
         """Sample what past inputs left at the first sample of a record, by layer."""
@@ -381,10 +384,9 @@ class Cascade:
         return system.after(states)
 
     def _observe(
-        self, system: CascadeSystem, scaling: Scaling, record: Record, suffix: str
+        self, system: CascadeSystem, scaling: Scaling, record: Record, suffix: str, inputs: Tensor
     ) -> None:
-        """Sample every trajectory, then the outputs."""
-        inputs = scaled_inputs(scaling, record)
+        """Sample every trajectory, then the outputs, of scaled inputs (*b, n, n_u)."""
         y, missing = outputs_of(record)
         scale, shift = as_tensor(scaling.output_scale), as_tensor(scaling.output_offset)
         signals = {INPUTS: system.driving(inputs)}
@@ -457,9 +459,9 @@ def see(signals: dict[str, Tensor], one: Wire) -> Tensor:
     return torch.cat([p.expand(batch + p.shape[-2:]) for p in parts], -1)
 
 
-def scaled_inputs(scaling: Scaling, record: Record) -> Tensor:
-    """Inputs (n, n_u) in standard deviations of the training record."""
-    u = record.tensors().inputs
+def scaled_inputs(scaling: Scaling, record: Record, inputs: Tensor | None = None) -> Tensor:
+    """Inputs (*b, n, n_u), by default a record's, in standard deviations of the training record."""
+    u = record.tensors().inputs if inputs is None else inputs
     if not u.shape[-1]:
         return u
     return (u - as_tensor(scaling.input_offset)) / as_tensor(scaling.input_scale)

@@ -460,7 +460,8 @@ class ObservedCascade(TorchDistribution):
     shape (n,), or (n, n_y). NaN marks a missing sample.
 
     Args:
-        system: layers given their parameters. time: (n,) or a `TimeGrid`. inputs: (n, n_u) scaled.
+        system: layers given their parameters. time: (n,) or a `TimeGrid`. inputs: (*b, n, n_u)
+            scaled.
         scale, shift: (n_y,) of the outputs: y = shift + scale * (scaled y).
     """
 
@@ -535,12 +536,14 @@ class ObservedCascade(TorchDistribution):
         return y if self._several else y.squeeze(-1)
 
 
-def collapsed_of(system: CascadeSystem, scaling: Scaling, record: Record) -> ObservedCascade:
-    """The distribution of a record's outputs."""
+def collapsed_of(
+    system: CascadeSystem, scaling: Scaling, record: Record, inputs: Tensor | None = None
+) -> ObservedCascade:
+    """The distribution of a record's outputs; `inputs` are scaled, by default the record's."""
     return ObservedCascade(
         system,
         record.time,
-        scaled_inputs(scaling, record),
+        scaled_inputs(scaling, record) if inputs is None else inputs,
         as_tensor(scaling.output_scale),
         as_tensor(scaling.output_offset),
     )
@@ -552,7 +555,9 @@ def outputs_with_gaps(record: Record) -> Tensor:
     return y if record.n_outputs > 1 else y[:, 0]
 
 
-def observe_collapsed(system: CascadeSystem, scaling: Scaling, record: Record, suffix: str) -> None:
-    """Observe (or sample) the outputs of one record."""
+def observe_collapsed(
+    system: CascadeSystem, scaling: Scaling, record: Record, suffix: str, inputs: Tensor
+) -> None:
+    """Observe (or sample) the outputs of one record, of scaled inputs (*b, n, n_u)."""
     y = outputs_with_gaps(record) if record.n_outputs else None
-    pyro.sample(f"y{suffix}", collapsed_of(system, scaling, record), obs=y)
+    pyro.sample(f"y{suffix}", collapsed_of(system, scaling, record, inputs), obs=y)

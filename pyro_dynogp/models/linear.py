@@ -184,6 +184,7 @@ class LinearDynamicGP:
         initial_state: ModalState | Tensor | None = None,
         *,
         process_noise: bool = True,
+        inputs: Tensor | None = None,
     ) -> LTIProcess:
         """Noise-free trajectory of the output along a record.
 
@@ -191,13 +192,15 @@ class LinearDynamicGP:
             system: parameters. record: time and inputs. scaling: of the training record.
             initial_state: state at the first time; by default the prior that the model states.
             process_noise: False for the response of the deterministic system.
+            inputs: u (*b, n, n_u) [input] in place of the record's.
         """
         modes = system.modes if process_noise else system.modes.without_process_noise()
         data = record.tensors()
-        inputs = data.inputs - as_tensor(scaling.input_offset) if self.inputs else None
+        u = data.inputs if inputs is None else inputs
+        driving = u - as_tensor(scaling.input_offset) if self.inputs else None
         if initial_state is None and self.initial_state == "integrated":
             initial_state = self.prior_state(system, modes)
-        return LTIProcess(modes, data.time, inputs, initial_state, offset=system.offset)
+        return LTIProcess(modes, data.time, driving, initial_state, offset=system.offset)
 
     @staticmethod
     def prior_state(system: LinearSystem, modes: Modes) -> ModalState:
@@ -213,8 +216,16 @@ class LinearDynamicGP:
         name = f"initial_state{suffix}"
         return {"initial_state": pyro.sample(name, dist.Normal(0.0 * one, one).to_event(1))}
 
-    def __call__(self, records: Record | Sequence[Record]) -> None:
-        """Run the Pyro model on one record or on several."""
+    def __call__(
+        self, records: Record | Sequence[Record], inputs: Sequence[Tensor] | None = None
+    ) -> None:
+        """Run the Pyro model on one record or on several.
+
+        Args:
+            records: with inputs and outputs.
+            inputs: for each record u (k, n, n_u) [input] in place of its own, where every site has
+                k values: each of them with inputs of its own.
+        """
         checked = self.check(records)
         single = len(checked) == 1
         scaling = self.scaling or Scaling.from_records(checked)
@@ -225,7 +236,8 @@ class LinearDynamicGP:
             state: Any = None
             if states:
                 state = initial_mean(system.past_inputs, states["initial_state"])
-            process = self.process(system, record, scaling, state)
+            u = None if inputs is None else inputs[index]
+            process = self.process(system, record, scaling, state, inputs=u)
             outputs = record.tensors().outputs
             if not self.several_outputs and record.n_outputs:
                 outputs = outputs[:, 0]

@@ -195,7 +195,7 @@ def test_inputs_are_delayed_alone_and_together() -> None:
     assert sets == {("a",), ("b",), ("a", "b")}
     together = [one for one in variants if len(one.channels) == 2]
     assert all(a.delay == b.delay for a, b in (one.channels for one in together))
-    finer = effects.DeadTime().refine(together[0], 0)
+    finer = effects.DeadTime().refine(together[0], record, 0)
     assert {len({c.delay for c in one.channels}) for one in finer} == {1}
     assert "Channels 'a' and 'b' act" in effects.DeadTime().sentence(found.evidence, together[0])
     again = effects.DeadTime().extend(together[0], found.evidence, record)

@@ -53,7 +53,7 @@ class Effect:
         """Variants of the model with the effect as a block; empty where it is only reported."""
         raise NotImplementedError
 
-    def refine(self, model: Model, times: int) -> Sequence[Model]:
+    def refine(self, model: Model, record: Record, times: int) -> Sequence[Model]:
         """Variants close to the best one so far, closer each time; none by default."""
         return []
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -43,7 +43,8 @@ class ExtraInput(Effect):
             plain = with_channel(model, Recorded(channel))
             if delay < 2.0 * record.sampling_time:
                 return [plain]
-            return [plain, with_channel(plain, Delayed(channel, delay))]
+            (later,) = _resolved([delay], record)
+            return [plain, with_channel(plain, Delayed(channel, later))]
         made: Channel
         if form in ("square", "absolute"):
             made = Transformed(channel, form, centre_of(record, channel))
@@ -85,7 +86,9 @@ class DeadTime(Effect):
             u, y = prepared.inputs[:, : len(names)], prepared.outputs[:, 0]
             found = {step * d for d in likely_delays(y, u, place, longest)}
             delays = grid | found | (around if channel in chosen else set())
-            tried = (_later(model, chosen, delay, 0.2 * step) for delay in sorted(delays))
+            tried = (
+                _later(model, chosen, delay, 0.2 * step) for delay in _resolved(delays, record)
+            )
             variants += [one for one in tried if one is not None]
         return variants
 
@@ -96,18 +99,22 @@ class DeadTime(Effect):
         start = f"Channel {names} acts" if len(found) == 1 else f"Channels {names} act"
         return f"{start} with a dead time of {found[0].delay:.3g}{unit_of(evidence)}."
 
-    def refine(self, model: Model, times: int) -> Sequence[Model]:
-        """The delay a little shorter and longer."""
+    def refine(self, model: Model, record: Record, times: int) -> Sequence[Model]:
+        """The delay a little shorter and longer, a sample or two at least."""
         found = self._found(model)
+        delay, step = found[0].delay, record.sampling_time
+        near = {share * delay for share in FINER[times]}
+        if record.is_regular:
+            near |= {delay + k * step for k in (-2, -1, 1, 2)}
         return [
             replace(
                 model,
                 channels=tuple(
-                    replace(one, delay=share * one.delay) if one in found else one
-                    for one in model.channels
+                    replace(one, delay=later) if one in found else one for one in model.channels
                 ),
             )
-            for share in FINER[times]
+            for later in _resolved(near, record)
+            if later != delay
         ]
 
     def _found(self, model: Model) -> list[Delayed]:
@@ -115,6 +122,19 @@ class DeadTime(Effect):
         last = model.channels[-1]
         assert isinstance(last, Delayed)
         return [c for c in model.channels if isinstance(c, Delayed) and c.delay == last.delay]
+
+
+def _resolved(delays: Iterable[float], record: Record) -> list[float]:
+    """Delays that a record can tell apart: on an even clock whole samples, one at least.
+
+    A held input that arrives within a sample is, at the samples, one that arrives with the next and
+    acts with another numerator: x[k+1] = phi x[k] + g1 u[k] + g2 u[k+1] for every fraction of it
+    (Franklin, Powell & Workman, Digital Control of Dynamic Systems, 3rd ed., section 4.3).
+    """
+    if not record.is_regular:
+        return sorted(delays)
+    step = record.sampling_time
+    return [step * count for count in sorted({max(round(one / step), 1) for one in delays})]
 
 
 def _later(model: Model, names: Sequence[str], more: float, least: float) -> Model | None:

@@ -84,7 +84,7 @@ class DeadZoneOfInput(Effect):
             for share in AROUND
         ]
 
-    def refine(self, model: Model, times: int) -> Sequence[Model]:
+    def refine(self, model: Model, record: Record, times: int) -> Sequence[Model]:
         """Each limit a little lower and higher."""
         last = model.channels[-1]
         assert isinstance(last, DeadZone)
@@ -112,6 +112,6 @@ class Hysteresis(Effect):
             return []
         return [with_channel(model, Play(channel, share * width)) for share in AROUND]
 
-    def refine(self, model: Model, times: int) -> Sequence[Model]:
+    def refine(self, model: Model, record: Record, times: int) -> Sequence[Model]:
         """The play a little narrower and wider."""
         return finer(model, "width", times)
