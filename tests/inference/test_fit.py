@@ -173,17 +173,18 @@ class TestVariational:
 
 
 def test_nuts_one_pair_of_300_samples(one_pair):
-    """The sampler mixes, and SVI's posterior agrees with it."""
+    """The sampler mixes, and SVI's posterior agrees with it; long chains are in `reference`."""
     record = simulate_record(one_pair, 0.1, n=300, seed=2)
     model = dgp.LinearDynamicGP(inputs=1, pairs=1)
-    options = {"restarts": 2, "progress": False}
-    nuts = dgp.fit(model, record, method="nuts", chains=4, draws=400, warmup=300, seed=1, **options)
+    options = {"restarts": 2, "progress": False, "workers": 1}
+    nuts = dgp.fit(model, record, method="nuts", chains=2, draws=80, warmup=50, seed=1, **options)
     r_hat = {k: v for k, v in nuts.diagnostics.items() if k.startswith("r_hat")}
     assert len(r_hat) == 8
-    assert max(r_hat.values()) < 1.01, r_hat
+    # Of two chains of 80 draws of the same distribution it is below 1.05 nearly always.
+    assert max(r_hat.values()) < 1.05, r_hat
     assert nuts.diagnostics["divergences"] <= 2
-    assert nuts.draws["noise_sd"].shape == (1600, 1)
-    svi = dgp.fit(model, record, method="svi", steps=400, draws=400, workers=1, **options)
+    assert nuts.draws["noise_sd"].shape == (160, 1)
+    svi = dgp.fit(model, record, method="svi", steps=400, draws=400, **options)
     for name in ("g_log_decay", "g_log_frequency", "g_input_gain", "noise_sd"):
         exact, approximate = nuts.draws[name], svi.draws[name]
         shift = (approximate.mean(0) - exact.mean(0)).abs() / exact.std(0)
