@@ -15,6 +15,7 @@ import joblib
 import numpy as np
 import torch
 from joblib.parallel import get_active_backend
+from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from pyro_dynogp._errors import invalid
@@ -24,22 +25,35 @@ Result = TypeVar("Result")
 
 
 @contextlib.contextmanager
-def seeded(seed: int) -> Iterator[None]:
-    """Seed torch, numpy and random inside; outside nothing has changed."""
-    states = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
+def one_thread() -> Iterator[None]:
+    """Inside, torch and the linear algebra of numpy and scipy run on one thread; also a decorator.
+
+    Matrices are small here: more threads gain nothing on an idle machine, wait for each other in
+    circles on a busy one, and let the order of a sum depend on how many processors there are.
+    """
     threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1):
+            yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@contextlib.contextmanager
+def seeded(seed: int) -> Iterator[None]:
+    """Seed torch, numpy and random inside, on one thread; outside nothing has changed."""
+    states = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
     torch.manual_seed(seed)
     np.random.seed(seed % 2**32)  # noqa: NPY002 (Pyro and its guides draw from the global state)
     random.seed(seed)
-    # The order of a sum must not depend on how many processors there are.
-    torch.set_num_threads(1)
     try:
-        yield
+        with one_thread():
+            yield
     finally:
         torch.set_rng_state(states[0])
         np.random.set_state(states[1])  # noqa: NPY002
         random.setstate(states[2])
-        torch.set_num_threads(threads)
 
 
 def child_seeds(seed: int, count: int) -> list[int]:
@@ -84,7 +98,7 @@ def parallel_map(
     with bar:
         if workers == 1 or len(items) <= 1:
             for item in items:
-                advance(function(item))
+                advance(_call(function, item))
             return results
         backend, _ = get_active_backend()
         local = type(backend).__name__ == "LokyBackend"
@@ -95,6 +109,6 @@ def parallel_map(
     return results
 
 
+@one_thread()
 def _call(function: Callable[[Any], Any], item: Any) -> Any:
-    torch.set_num_threads(1)
     return function(item)

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 import torch
 from hypothesis import settings
+from threadpoolctl import threadpool_limits
 
 import pyro_dynogp as dgp
 
-# As many processes run tests as there are processors: more threads would wait for each other.
+# As many processes run tests as there are processors: more threads would wait for each other, here
+# and in the processes that tests start.
 torch.set_num_threads(1)
+threadpool_limits(1)
+os.environ["OMP_NUM_THREADS"] = "1"
 settings.register_profile("deterministic", derandomize=True, deadline=None)
 settings.load_profile("deterministic")
 

@@ -5,8 +5,9 @@ import random
 import numpy as np
 import pytest
 import torch
+from threadpoolctl import threadpool_info, threadpool_limits
 
-from pyro_dynogp.parallel import child_seeds, parallel_map, seeded
+from pyro_dynogp.parallel import child_seeds, one_thread, parallel_map, seeded
 
 
 def square(x):
@@ -46,3 +47,25 @@ def test_seeded_is_reproducible_and_leaves_no_trace():
 def test_child_seeds_differ_and_repeat():
     assert child_seeds(4, 5) == child_seeds(4, 5)
     assert len({*child_seeds(4, 5), *child_seeds(5, 5)}) == 10
+
+
+def threads(_=None):
+    """Threads of torch, and of every library of linear algebra that is loaded."""
+    return [torch.get_num_threads(), *(pool["num_threads"] for pool in threadpool_info())]
+
+
+@pytest.mark.parametrize("inside", [one_thread, lambda: seeded(3)])
+def test_work_is_done_on_one_thread_and_others_get_theirs_back(inside):
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        with threadpool_limits(2):
+            with pytest.raises(KeyError, match="stop"), inside():
+                found = threads()
+                raise KeyError("stop")
+            after = threads()
+            (mapped,) = parallel_map(threads, [0])
+    finally:
+        torch.set_num_threads(before)
+    assert set(found) == set(mapped) == {1}
+    assert set(after) == {2}

@@ -33,7 +33,7 @@ from pyro_dynogp.discrepancy.trials import one_step_density, without
 from pyro_dynogp.inference.fit import fit as fit_model
 from pyro_dynogp.inference.result import Method
 from pyro_dynogp.models.cascade import Cascade
-from pyro_dynogp.parallel import parallel_map
+from pyro_dynogp.parallel import one_thread, parallel_map
 from pyro_dynogp.prediction.clock import joined
 from pyro_dynogp.prediction.scores import scores
 from pyro_dynogp.record import Record
@@ -48,6 +48,7 @@ LAST_LINEAR_STARTS, LAST_CASCADE_STARTS = 2, 1
 SCORES = ("rmse", "mae", "nrmse", "crps", "coverage_50", "coverage_95")
 
 
+@one_thread()
 def close_loop(
     fit: Fit,
     record: Record,
