@@ -54,18 +54,27 @@ def threads(_=None):
     return [torch.get_num_threads(), *(pool["num_threads"] for pool in threadpool_info())]
 
 
-@pytest.mark.parametrize("inside", [one_thread, lambda: seeded(3)])
-def test_work_is_done_on_one_thread_and_others_get_theirs_back(inside):
+@pytest.fixture
+def two_threads():
     before = torch.get_num_threads()
     torch.set_num_threads(2)
-    try:
-        with threadpool_limits(2):
-            with pytest.raises(KeyError, match="stop"), inside():
-                found = threads()
-                raise KeyError("stop")
-            after = threads()
-            (mapped,) = parallel_map(threads, [0])
-    finally:
-        torch.set_num_threads(before)
-    assert set(found) == set(mapped) == {1}
-    assert set(after) == {2}
+    with threadpool_limits(2):
+        yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("two_threads")
+@pytest.mark.parametrize("inside", [one_thread(), seeded(3)])
+def test_work_is_done_on_one_thread_and_others_get_theirs_back(inside):
+    found = []
+
+    @inside
+    def fails():
+        found.extend(threads())
+        raise KeyError("stop")
+
+    with pytest.raises(KeyError, match="stop"):
+        fails()
+    assert set(found) == {1}
+    assert set(threads()) == {2}
+    assert set(parallel_map(threads, [0])[0]) == {1}

@@ -6,9 +6,9 @@ from tests.benchmarks.calibration import KEPT, _rank, simulate_ranks, uniformity
 
 
 def test_ranks_of_a_few_replicates_are_not_skewed():
-    ranks = simulate_ranks(8, samples=30, thin=1, seed=3)
+    ranks = simulate_ranks(4, samples=30, thin=1, seed=3)
     assert len(ranks) == 11
-    spread = np.sqrt(((KEPT + 1) ** 2 - 1) / 12 / 8)
+    spread = np.sqrt(((KEPT + 1) ** 2 - 1) / 12 / 4)
     for name, values in ranks.items():
         assert ((values >= 0) & (values <= KEPT)).all()
         assert abs(values.mean() - KEPT / 2) < 4 * spread, name
