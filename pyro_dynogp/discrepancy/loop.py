@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -145,9 +145,7 @@ def close_loop(
     fitted = _final(fits, data.known, workers, progress)
     base, extended = fitted[0], fitted[-1]
     clock.next("last fits")
-    return _report(
-        base, extended, state, accepted, reported, attempts, warnings, left, clock.seconds
-    )
+    return _report(base, extended, state, accepted, reported, attempts, warnings, left, clock)
 
 
 class _Clock:
@@ -310,7 +308,7 @@ def _report(
     attempts: Sequence[Attempt],
     warnings: Sequence[str],
     left: bool,
-    seconds: Mapping[str, float],
+    clock: _Clock,
 ) -> Report:
     """Open block C, once."""
     data = state.data
@@ -323,12 +321,13 @@ def _report(
     densities = [one_step_density(one, whole)[sealed] for one in (base, extended)]
     there = np.isfinite(densities[0])
     gain = densities[1][there] - densities[0][there]
+    clock.next("scores of the last block")
     tests = _tested([f for f, _ in accepted], (base, extended), whole, sealed, state)
+    clock.next("residual tests of the last block")
+    effects = [_effect(f, c, extended, data.known) for f, c in accepted]
+    clock.next("numbers of the effects")
     return Report(
-        effects=(
-            *(_effect(f, c, extended, data.known) for f, c in accepted),
-            *(_only_reported(f) for f in reported),
-        ),
+        effects=(*effects, *(_only_reported(f) for f in reported)),
         outcome=_outcome(bool(accepted), left),
         before=before,
         after=after,
@@ -346,7 +345,7 @@ def _report(
         forecast_after=forecasts[1],
         model_before=words.describe(base.model),
         model_after=words.describe(extended.model),
-        seconds=dict(seconds),
+        seconds=dict(clock.seconds),
     )
 
 
