@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
+
+from pyro_dynogp._compiled_cache import OPTIONS
 
 # Highest order that is tried.
 ORDER = 24
@@ -27,8 +30,25 @@ class Whitener:
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """Filtered along the first dimension: (n, ...) to (n - p, ...); NaN spreads over p + 1."""
-        p, n = self.order, len(x)
-        out = x[p:].astype(float, copy=True)
-        for k, a in enumerate(self.coefficients, start=1):
-            out -= a * x[p - k : n - k]
-        return out
+        flat = np.ascontiguousarray(x, dtype=float).reshape(-1)
+        width = flat.size // max(len(x), 1)
+        return _filtered(self.coefficients, flat, width).reshape(-1, *x.shape[1:])
+
+
+# Numbers that stay in the processor's nearest memory while all coefficients go over them.
+BLOCK = 1024
+
+
+@njit(**OPTIONS)
+def _filtered(a: np.ndarray, x: np.ndarray, width: int) -> np.ndarray:
+    """Rows of `width` numbers, one after the other, filtered."""
+    p = len(a)
+    out = x[p * width :].copy()
+    for begin in range(0, len(out), BLOCK):
+        block = out[begin : begin + BLOCK]
+        for k in range(p):
+            shift = begin + (p - 1 - k) * width
+            past = x[shift : shift + len(block)]
+            for i in range(len(block)):
+                block[i] -= a[k] * past[i]
+    return out
