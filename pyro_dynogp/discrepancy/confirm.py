@@ -19,6 +19,9 @@ from pyro_dynogp.record import Record
 
 # A gain counts if it is more than so many block standard errors, and than so many nats.
 ERRORS = 2.0
+# Or if it still is where no sample counts for more nats: an outlier may gain hundreds, which make
+# the standard error as large as the sum. What is left is less than the whole gain, never more.
+CAP = 10.0
 
 # Where densities are scored: after the training data, or on blocks spread over the whole record.
 Where = Literal["after", "spread"]
@@ -48,18 +51,13 @@ class Confirmed:
 
 @dataclass(frozen=True, eq=False)
 class _Judged:
-    """A candidate, its refit, its gain over the model without it, and whether forecasts suffer."""
+    """A candidate, its refit, its gain over the model without it, and whether that is enough."""
 
     found: Found
     kind: Kind
     tried: Tried
     attempt: Attempt
-    harms: bool = False
-
-    @property
-    def helps(self) -> bool:
-        a = self.attempt
-        return bool(a.gain > NATS and a.gain > ERRORS * a.gain_error) and not self.harms
+    helps: bool = False
 
 
 def confirm(
@@ -192,14 +190,34 @@ def _judge(found: Found, kind: Kind, tried: Tried, base: Tried, number: int) -> 
     d = tried.densities - base.densities
     gain, error = float(d.sum()), block_standard_error(d)[0]
     reason = f"held-out elpd {gain:+.1f} +- {error:.1f} nats"
-    harms = False
-    if len(tried.forecasts):  # what is one step ahead for the noise must not cost the structure
-        d = tried.forecasts - base.forecasts
-        loss, spread = -float(d.sum()), block_standard_error(d)[0]
-        harms = loss > max(NATS, ERRORS * spread)
-        reason += f"; forecasts worse by {loss:.1f} +- {spread:.1f}" if harms else ""
+    helps, capped = _counts(d), np.minimum(d, CAP)
+    if not helps and _counts(capped):
+        helps = True
+        reason += f"; {capped.sum():+.1f} with no sample counted for more than {CAP:.0f}"
+    if len(tried.errors):  # what is one step ahead for the noise must not cost the structure
+        loss = _loss(tried.errors, base.errors)
+        if harms := _counts(loss):
+            reason += (
+                f"; forecasts worse by {loss.sum():.1f} +- {block_standard_error(loss)[0]:.1f}"
+            )
+        helps = helps and not harms
     attempt = Attempt(number, evidence, q, "rejected", reason, gain, error, tried.seconds)
-    return _Judged(found, kind, tried, attempt, harms)
+    return _Judged(found, kind, tried, attempt, helps)
+
+
+def _counts(gains: np.ndarray) -> bool:
+    """Whether gains (N,) of single samples are certainly more than nothing in all."""
+    return bool(gains.sum() > max(NATS, ERRORS * block_standard_error(gains)[0]))
+
+
+def _loss(errors: np.ndarray, base: np.ndarray) -> np.ndarray:
+    """By how much forecasts are worse than those of the base, sample by sample [nats].
+
+    Log-densities of errors (M, n_y) under one double exponential distribution, that which suits the
+    base: what the noise is thought to be does not come in, and outliers hardly.
+    """
+    worse = (np.abs(errors) - np.abs(base)) / np.nanmean(np.abs(base), axis=0)
+    return worse[np.isfinite(worse)]
 
 
 def _first_in_line(better: Sequence[_Judged], level: float) -> list[_Judged]:

@@ -69,8 +69,9 @@ def close_loop(
     discovery rate below `level` for one effect); if so, effects whose test rejects at `level`, and
     their nearest relatives, are added to the model one at a time and fitted to A; the one that
     raises the log-density of held-out data most is kept if it does so by more than two block
-    standard errors and 4 nats, effects between inputs and output before those of the noise, which
-    their lack imitates. Of effects that explain as much the one that leaves least open is kept, and
+    standard errors and 4 nats (or, as outliers make both large, with no sample counted for more
+    than 10 nats), effects between inputs and output before those of the noise, which their lack
+    imitates. Of effects that explain as much the one that leaves least open is kept, and
     the others are reported as ties. Rounds end where nothing is left, or nothing helps. An effect
     that no block mends (feedback) is among the report's effects, after those that were added.
 

@@ -68,7 +68,8 @@ class Tried:
             [nats].
         seconds: it took. failure: why there is no result, "" if there is one.
         fit: of the model to the first fold's training data.
-        forecasts: (N,) where densities are one step ahead, those of forecasts beside them.
+        errors: (M, n_y) where densities are one step ahead, errors of forecasts of the same
+            stretches beside them [output], NaN where missing.
     """
 
     model: Model
@@ -76,14 +77,14 @@ class Tried:
     seconds: float
     failure: str = ""
     fit: Fit | None = None
-    forecasts: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    errors: np.ndarray = field(default_factory=lambda: np.zeros((0, 1)))
 
 
 def run(trial: Trial) -> Tried:
     """Refit the variants on the first fold's training data, the best on all; score the folds."""
     begin = time.perf_counter()
     first: Fit | None = None
-    parts, beside = [np.zeros(0)], [np.zeros(0)]
+    parts, beside = [np.zeros(0)], [np.zeros((0, trial.record.n_outputs))]
     failure = ""
     try:
         first = _kept(trial, without(trial.record, trial.folds[0]))
@@ -94,7 +95,7 @@ def run(trial: Trial) -> Tried:
                 found = quick_fit(_unscaled(first), rest, trial.seed, trial.base)
             parts.append(held_out_density(found, trial.record, fold, trial.score))
             if trial.score == "one step":
-                beside.append(held_out_density(found, trial.record, fold, "forecast"))
+                beside.append(forecast_errors(found, trial.record, fold)[0][fold])
     except ValueError as error:
         failure, parts = str(error), [np.zeros(0)]
     return Tried(
@@ -164,16 +165,27 @@ def held_out_density(fit: Fit, record: Record, fold: np.ndarray, score: Score) -
     if score == "one step":
         density = one_step_density(fit, prepared)
     else:
-        density = np.full(there.shape, np.nan)
-        z, sd = density.copy(), density.copy()
-        for part in stretches(fold):
-            found = fit.forecast(prepared[: part.start], prepared[part], seed=fit.seed)
-            z[part] = (prepared.outputs[part] - found.mean) / found.sd
-            sd[part] = found.sd
+        error, sd = forecast_errors(fit, prepared, fold)
+        z = error / sd
         spread = np.sqrt(np.nanmean(z[fold] ** 2, axis=0))
         density = -0.5 * ((z / spread) ** 2 + np.log(2.0 * np.pi)) - np.log(spread * sd)
     scored: np.ndarray = density[fold][there[fold]]
     return scored
+
+
+def forecast_errors(fit: Fit, record: Record, fold: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Errors (n, n_y) of forecasts of every stretch of a fold from its past, and their sds.
+
+    In units of the output, NaN outside the fold; errors are NaN where the output is missing, too.
+    """
+    prepared = fit.model.check(record)[0]
+    error = np.full(prepared.outputs.shape, np.nan)
+    sd = error.copy()
+    for part in stretches(fold):
+        found = fit.forecast(prepared[: part.start], prepared[part], seed=fit.seed)
+        error[part] = prepared.outputs[part] - found.mean
+        sd[part] = found.sd
+    return error, sd
 
 
 def one_step_density(fit: Fit, record: Record) -> np.ndarray:

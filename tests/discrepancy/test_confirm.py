@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.stats import binom
 
 import pyro_dynogp as dgp
 from pyro_dynogp.channels import Calendar, Delayed, ShiftedClock
@@ -65,16 +66,43 @@ def test_where_noise_alone_is_certain_structure_must_speak_for_itself() -> None:
     assert names(_first_in_line([own, tails], 0.05)) == ["extra input"]
 
 
+def judged_noise(gains: np.ndarray, errors: np.ndarray, before: np.ndarray) -> _Judged:
+    """A candidate for the noise with gains (N,), and errors of forecasts before and after."""
+    found = spoken_for(effects.HeavyTails(), 1e-9, 1e-8)
+    base = tried(0.0 * gains, errors=before[:, None])
+    return _judge(found, ("after", "one step"), tried(gains, errors=errors[:, None]), base, 1)
+
+
 def test_noise_that_costs_the_forecasts_does_not_help() -> None:
-    n, found = 100, spoken_for(effects.HeavyTails(), 1e-9, 1e-8)
-    base = tried(np.zeros(n), forecasts=np.zeros(n))
-    good = _judge(found, ("after", "one step"), tried(np.ones(n), forecasts=np.zeros(n)), base, 1)
-    bad = _judge(
-        found, ("after", "one step"), tried(np.ones(n), forecasts=np.full(n, -0.5)), base, 1
-    )
-    assert good.helps
+    before, gains = 3.0 * np.resize([1.0, -1.0], 100), np.ones(100)
+    assert judged_noise(gains, before, before).helps
+    bad = judged_noise(gains, 1.5 * before, before)
     assert not bad.helps
-    assert "forecasts worse by 50.0" in bad.attempt.reason
+    assert "forecasts worse by 50.0 +- 0.0" in bad.attempt.reason
+    wild = before.copy()
+    wild[17] = 1e3  # of the noise, before and after
+    assert judged_noise(gains, wild, wild).helps
+    missing = np.where(np.arange(100) % 3 == 0, np.nan, 1.5 * before)
+    assert not judged_noise(gains, missing, missing / 1.5).helps
+
+
+def test_one_outlier_does_not_hide_what_all_samples_gain() -> None:
+    same = np.ones(300)
+    gains = 0.3 + np.resize([0.4, -0.4], 300)
+    gains[100] = 400.0
+    found = judged_noise(gains, same, same)
+    assert found.helps
+    assert found.attempt.gain < 2.0 * found.attempt.gain_error
+    assert "+99.3 with no sample counted for more than 10" in found.attempt.reason
+    assert not judged_noise(gains - 0.4, same, same).helps
+
+
+@pytest.mark.parametrize("freedom", [2.5, 5.0, 1e3])
+def test_gains_of_nothing_seldom_count(freedom: float) -> None:
+    draws, same = np.random.default_rng(1).standard_t(freedom, (1000, 300)), np.ones(300)
+    count = sum(judged_noise(gains, same, same).helps for gains in draws)
+    # Two standard errors are 2.3 % of normal sums; more where they are estimated from 300 samples.
+    assert binom.sf(count - 1, 1000, 0.04) > 1e-3
 
 
 def test_folds_have_data_on_either_side_of_every_instant() -> None:
