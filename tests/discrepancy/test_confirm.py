@@ -257,6 +257,8 @@ def test_a_calendar_moves_to_another_clock_instead_of_being_there_twice() -> Non
     same = spoken_for(effects.CalendarEffect(), 0.01, 0.1, what=what, zone="UTC")
     (finer,) = effects.CalendarEffect().extend(model, same.evidence, record)
     assert [c.harmonics for c in finer.channels] == [8]
+    (every_three_hours,) = effects.CalendarEffect().extend(model, same.evidence, record[::3])
+    assert [c.harmonics for c in every_three_hours.channels] == [4]
 
 
 def test_feedback_is_among_the_effects_and_changes_nothing() -> None:

@@ -119,7 +119,8 @@ class CalendarEffect(Effect):
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
         """The part of the calendar as direct inputs; or all that the model has, on that clock.
 
-        In place of the same part, if the model has it: with twice the harmonics if on that clock.
+        In place of the same part, if the model has it: with twice the harmonics if on that clock,
+        as far as the steps of the record tell harmonics of a day apart.
         """
         what, zone = str(evidence.where["what"]), str(evidence.where["zone"])
         part = CALENDAR_PARTS.get(what, what)
@@ -129,6 +130,8 @@ class CalendarEffect(Effect):
             if one.what == part:
                 plain = without_channel(plain, one)
                 harmonics = max(harmonics, one.harmonics * (2 if one.zone == zone else 1))
+        if part != "time of year":
+            harmonics = max(1, min(harmonics, int(0.5 * DAY / record.sampling_time)))
         variants = [with_channel(plain, Calendar(part, zone, harmonics))]
         if any(one.zone != zone for one in there):
             channels = tuple(
