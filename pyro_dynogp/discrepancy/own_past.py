@@ -80,20 +80,25 @@ def regress(
     X = np.column_stack(bases)
     K = np.array([max(b.shape[1], 1) for b in bases], dtype=float)
     ends = np.cumsum([b.shape[1] for b in bases])
-    own = _ratios((series[:, there] - (series[:, there] @ Z) @ Z.T)[None], X, ends, samples)[0]
+    free = series[:, there] - (series[:, there] @ Z) @ Z.T
+    own = _ratios(free @ free.T, free @ X, ends, samples)
     z = (own - K) / np.sqrt(2.0 * K)
     best = int(np.argmax(z))
     p_value = 1.0
     if replicates:
 
-        def beside(made: np.ndarray) -> Iterator[np.ndarray]:
-            """Series and their past less what the nuisance explains, some at a time."""
+        rows = np.flatnonzero(there) - np.arange(p + 1)[:, None]
+
+        def beside(made: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+            """Some series and their past (R, p + 1, m), and products of all less the nuisance."""
             for start in range(0, len(made), CHUNK):
-                lags = np.stack([_lags(s, p)[:, there] for s in made[start : start + CHUNK]])
-                yield lags - (lags @ Z) @ Z.T
+                lags = made[start : start + CHUNK, rows]
+                taken = lags @ Z  # replicates are noise: little is lost in the difference
+                yield lags, lags @ lags.swapaxes(1, 2) - taken @ taken.swapaxes(1, 2)
 
         made = _replicates(residual, series, N, there, beside, deviations, replicates, seed)
-        null = np.concatenate([_ratios(lags, X, ends, samples) for lags in beside(made)])
+        # X has nothing of the nuisance.
+        null = np.concatenate([_ratios(G, lags @ X, ends, samples) for lags, G in beside(made)])
         z_null = ((null - K) / np.sqrt(2.0 * K)).max(1)
         p_value = tail_probability(z_null, float(z[best]))
     weights, fitted = _fit(residual, series, variants[best], N, there)
@@ -156,15 +161,16 @@ def _lags(x: np.ndarray, p: int) -> np.ndarray:
     return out
 
 
-def _ratios(lags: np.ndarray, X: np.ndarray, ends: np.ndarray, samples: int) -> np.ndarray:
-    """Twice the log likelihood ratio of each variant, (R, J).
+def _ratios(own: np.ndarray, cross: np.ndarray, ends: np.ndarray, samples: int) -> np.ndarray:
+    """Twice the log likelihood ratio of each variant, (*R, J).
 
     Args:
-        lags: (R, p + 1, m) series and their past, less what the nuisance explains.
-        X: (m, K1 + ... + KJ) orthonormal columns of each variant, likewise. ends: (J,) of them.
-        samples: degrees of freedom.
+        own: (*R, p + 1, p + 1) products of a series and its past, less what the nuisance explains.
+        cross: (*R, p + 1, K1 + ... + KJ) with orthonormal columns of each variant, likewise.
+        ends: (J,) of them. samples: degrees of freedom.
     """
-    own, cross = lags @ lags.swapaxes(1, 2), lags @ X
+    if own.ndim == 2:
+        return _ratios(own[None], cross[None], ends, samples)[0]
     past = own[:, 1:, 1:]
     # What the past explains of the present and of the columns; rounding must not make it singular.
     past = past + 1e-10 * np.trace(past, axis1=1, axis2=2)[:, None, None] * np.eye(past.shape[1])
@@ -187,7 +193,7 @@ def _replicates(
     series: np.ndarray,
     N: np.ndarray,
     there: np.ndarray,
-    beside: Callable[[np.ndarray], Iterator[np.ndarray]],
+    beside: Callable[[np.ndarray], Iterator[tuple[np.ndarray, np.ndarray]]],
     deviations: np.ndarray | None,
     count: int,
     seed: int,
@@ -210,7 +216,7 @@ def _replicates(
         return lfilter([1.0], np.concatenate([[1.0], -a]), driven)[:, RUN_IN:]
 
     a = _stable(found[:p])
-    own = [lags @ lags.swapaxes(1, 2) for lags in beside(made(a, drawn[: 2 * CHUNK]))]
+    own = [G for _, G in beside(made(a, drawn[: 2 * CHUNK]))]
     again = np.concatenate([np.linalg.solve(G[:, 1:, 1:], G[:, 1:, :1])[:, :, 0] for G in own])
     out = made(_stable(2.0 * a - again.mean(0)), drawn)
     if deviations is not None and len(deviations):
