@@ -90,7 +90,9 @@ def site_dimensions(
             linear = isinstance(model, LinearDynamicGP)
             state = f"initial_state{suffix}" if linear else f"{name}_initial_state{suffix}"
             out[state] = (place.own("state"),)
-    return out | _static("log_noise", "input", "output", "log_noise_inducing", False)
+    follows = isinstance(model, Cascade) and model.likelihood.of == "output"
+    driver = "output" if follows else "input"
+    return out | _static("log_noise", driver, "output", "log_noise_inducing", False)
 
 
 def _dynamic(place: Place) -> dict[str, tuple[str, ...]]:

@@ -22,6 +22,9 @@ ERRORS = 2.0
 # Or if it still is where no sample counts for more nats: an outlier may gain hundreds, which make
 # the standard error as large as the sum. What is left is less than the whole gain, never more.
 CAP = 10.0
+# Noise may cost the forecasts so much of their mean absolute error: other weights of the samples
+# move a model a little, which a long record is certain of; structure taken for noise costs more.
+HARM = 0.05
 
 # Where densities are scored: after the training data, or on blocks spread over the whole record.
 Where = Literal["after", "spread"]
@@ -196,7 +199,7 @@ def _judge(found: Found, kind: Kind, tried: Tried, base: Tried, number: int) -> 
         reason += f"; {capped.sum():+.1f} with no sample counted for more than {CAP:.0f}"
     if len(tried.errors):  # what is one step ahead for the noise must not cost the structure
         loss = _loss(tried.errors, base.errors)
-        if harms := _counts(loss):
+        if harms := _counts(loss) and loss.mean() > HARM:
             reason += (
                 f"; forecasts worse by {loss.sum():.1f} +- {block_standard_error(loss)[0]:.1f}"
             )

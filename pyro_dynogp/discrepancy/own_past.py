@@ -86,7 +86,6 @@ def regress(
     best = int(np.argmax(z))
     p_value = 1.0
     if replicates:
-
         rows = np.flatnonzero(there) - np.arange(p + 1)[:, None]
 
         def beside(made: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -63,7 +63,7 @@ def describe(model: Model) -> tuple[str, ...]:
     likelihood = cascade.likelihood
     noise = "Gaussian noise"
     if likelihood.varying:
-        noise = "Gaussian noise that varies with the inputs"
+        noise = f"Gaussian noise that varies with the {likelihood.of}"
     elif likelihood.degrees_of_freedom is not None:
         noise = f"Student-t noise, {likelihood.degrees_of_freedom:.3g} degrees of freedom"
     return (*lines, noise)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 import pyro
@@ -15,6 +16,8 @@ from torch import Tensor
 from pyro_dynogp._errors import invalid
 from pyro_dynogp.layers.static import StaticFunction, sample_static
 
+# What varying noise is a function of.
+Driver = Literal["inputs", "output"]
 # Components of the Gaussian mixture that stands for a Student-t.
 COMPONENTS = 16
 # Prior of the standard deviation: log-normal around this share of the output's.
@@ -30,14 +33,17 @@ class Likelihood:
 
     Attributes:
         degrees_of_freedom: of a Student-t; None for a Gaussian.
-        varying: whether the logarithm of the standard deviation is a Gaussian process of the
-            (scaled) inputs, instead of constant.
+        varying: whether the logarithm of the standard deviation is a Gaussian process, instead of
+            constant.
         inducing: number of inducing values of that process.
+        of: what it is a function of: "inputs", or "output", the model's output with neither
+            process noise nor measurement noise.
     """
 
     degrees_of_freedom: float | None = None
     varying: bool = False
     inducing: int = 8
+    of: Driver = "inputs"
 
     def __post_init__(self) -> None:
         nu = self.degrees_of_freedom
@@ -45,6 +51,8 @@ class Likelihood:
             raise invalid("degrees_of_freedom", expected="a number > 0", got=repr(nu))
         if self.inducing < 1:
             raise invalid("inducing", expected="a whole number >= 1", got=repr(self.inducing))
+        if self.of not in get_args(Driver):
+            raise invalid("of", expected="'inputs' or 'output'", got=repr(self.of))
 
     @property
     def gaussian(self) -> bool:
@@ -55,7 +63,7 @@ class Likelihood:
         """Sample its parameters.
 
         Sites: ``noise_sd`` (n_y,), log-normal around a tenth of the output's standard deviation;
-        with `varying`, ``log_noise_...`` instead, those of a static layer of the inputs, which
+        with `varying`, ``log_noise_...`` instead, those of a static layer of what drives it, which
         gives log(sd / 0.1).
         """
         if self.varying:
@@ -63,10 +71,11 @@ class Likelihood:
                 raise invalid(
                     "likelihood",
                     expected="constant noise for a model without inputs",
-                    got="noise that varies with the inputs",
+                    got=f"noise that varies with the {self.of}",
                 )
+            channels = inputs if self.of == "inputs" else outputs
             function = sample_static(
-                "log_noise", channels=inputs, outputs=outputs, inducing=self.inducing
+                "log_noise", channels=channels, outputs=outputs, inducing=self.inducing
             )
             return Noise(self, None, function)
         zero = torch.zeros(outputs, dtype=torch.float64)
@@ -93,9 +102,18 @@ def StudentT(degrees_of_freedom: float = 4.0) -> Likelihood:
     return Likelihood(degrees_of_freedom=float(degrees_of_freedom))
 
 
-def Heteroscedastic(inducing: int = 8) -> Likelihood:
-    """White Gaussian noise whose log standard deviation is a Gaussian process of the inputs."""
-    return Likelihood(varying=True, inducing=inducing)
+def Heteroscedastic(inducing: int = 8, of: Driver = "inputs") -> Likelihood:
+    """White Gaussian noise whose log standard deviation is a Gaussian process.
+
+    Args:
+        inducing: number of its inducing values.
+        of: "inputs", or "output" for noise that grows with what is measured: a function of the
+            output that the inputs alone cause (no process noise, static layers at their mean).
+
+    Raises:
+        ValueError: on other values.
+    """
+    return Likelihood(varying=True, inducing=inducing, of=of)
 
 
 def student_components(nu: float, count: int = COMPONENTS) -> tuple[np.ndarray, np.ndarray]:
@@ -119,7 +137,7 @@ class Noise:
 
     Attributes:
         likelihood: its kind. constant_sd: (*b, n_y), or None where it varies.
-        log_sd: static function of the inputs, or None.
+        log_sd: static function of what drives the noise, or None.
     """
 
     likelihood: Likelihood
@@ -134,14 +152,14 @@ class Noise:
         assert self.log_sd is not None
         return self.log_sd.batch_shape
 
-    def sd(self, inputs: Tensor) -> Tensor:
-        """Scale (*b, n, n_y) at each sample of the scaled inputs (n, n_u)."""
+    def sd(self, driver: Tensor) -> Tensor:
+        """Scale (*b, n, n_y) at each sample of the scaled driver (*b, n, d)."""
         if self.constant_sd is not None:
-            n = inputs.shape[-2]
+            n = driver.shape[-2]
             sd = self.constant_sd.unsqueeze(-2)
             return sd.expand((*sd.shape[:-2], n, sd.shape[-1]))
         assert self.log_sd is not None
-        return TYPICAL * self.log_sd.mean(inputs).exp()
+        return TYPICAL * self.log_sd.mean(driver).exp()
 
     def distribution(self, mean: Tensor, sd: Tensor, missing: Tensor | None) -> dist.Distribution:
         """Of measured outputs (*b, *event) given mean and scale; missing ones are not scored."""

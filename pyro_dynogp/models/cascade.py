@@ -19,7 +19,9 @@ from pyro_dynogp.distributions.process import LTIProcess
 from pyro_dynogp.layers.noise import Gaussian, Likelihood, Noise
 from pyro_dynogp.layers.static import StaticFunction, sample_static
 from pyro_dynogp.lti.covariance import state_covariance
+from pyro_dynogp.lti.grid import TimeGrid, time_grid
 from pyro_dynogp.lti.modes import Modes
+from pyro_dynogp.lti.response import mean_response
 from pyro_dynogp.lti.state import ModalState
 from pyro_dynogp.models.layers import INPUTS, Dynamic, Layer, Static, Wire, wire
 from pyro_dynogp.models.linear import (
@@ -129,6 +131,32 @@ class CascadeSystem:
             return level
         direct = inputs[..., -self.direct.shape[-1] :] @ self.direct.mT
         return direct if level is None else level + direct
+
+    def undisturbed(self, inputs: Tensor, grid: TimeGrid) -> Tensor:
+        """Output (*b, n, n_y) that inputs (*b, n, n_u) alone cause, static layers at their mean.
+
+        Dynamic layers start from the first state that is known of them, else at rest.
+        """
+        signals = {INPUTS: self.driving(inputs)}
+        for one, layer in zip(self.wires, self.layers, strict=True):
+            x = see(signals, one)
+            if isinstance(layer, DynamicSystem):
+                modes = layer.modes
+                driven = x if modes.inputs else None
+                value = mean_response(modes, grid, driven, layer.first_state).output
+                signals[one.name] = value if modes.several_outputs else value.unsqueeze(-1)
+            else:
+                signals[one.name] = layer.function.mean(x)
+        output = signals[self.wires[-1].name]
+        level = self.level(inputs)
+        return output if level is None else output + level
+
+    def noise_sd(self, inputs: Tensor, grid: TimeGrid) -> Tensor:
+        """Scale (*b, n, n_y) of the measurement noise along scaled inputs (*b, n, n_u)."""
+        likelihood = self.noise.likelihood
+        if likelihood.varying and likelihood.of == "output":
+            return self.noise.sd(self.undisturbed(inputs, grid))
+        return self.noise.sd(self.driving(inputs))
 
     def after(self, states: Mapping[str, Tensor]) -> CascadeSystem:
         """The cascade after past inputs, given by standard normal numbers (*b, 2P) by layer."""
@@ -406,7 +434,8 @@ class Cascade:
         level = system.level(inputs)
         if level is not None:
             mean = mean + level
-        mean, sd = shift + scale * mean, scale * system.noise.sd(system.driving(inputs))
+        mean = shift + scale * mean
+        sd = scale * system.noise_sd(inputs, time_grid(record.time))
         if not self.several_outputs:
             mean, sd = mean.squeeze(-1), sd.squeeze(-1)
         noise = system.noise.distribution(mean, sd, missing)

@@ -324,7 +324,7 @@ def assemble(
             walk.signals[one.name] = walk.dynamic(one, layer)
         else:
             walk.signals[one.name] = walk.static(one, layer)
-    return walk.finish(system.noise.sd(system.driving(inputs)))
+    return walk.finish(system.noise_sd(inputs, grid))
 
 
 def step_noises(modes: Modes, steps: Tensor) -> Tensor:

@@ -41,9 +41,8 @@ def log_density(system: CascadeSystem, grid: TimeGrid, inputs: Tensor, y: Tensor
         system: for which `has_exact_density` holds. grid: time axis. inputs: (n, n_u) scaled.
         y: (*s, n, n_y) scaled outputs, NaN where missing.
     """
-    driving = system.driving(inputs)
-    signals = {INPUTS: driving}
-    sd = system.noise.sd(driving)
+    signals = {INPUTS: system.driving(inputs)}
+    sd = system.noise_sd(inputs, grid)
     level = system.level(inputs)
     if level is not None:
         y = y - level

@@ -43,8 +43,9 @@ def simulate(fit: Fit, record: Record, process_noise: bool, samples: int, seed: 
         grid = time_grid(record.time)
         problem = assemble(system, grid, inputs, process_noise=process_noise).problem
         start = JointState(problem.m0, problem.P0)  # nothing is known of past inputs
+        sd = system.noise_sd(inputs, grid)
         return _forward(
-            fit, record, grid, inputs, start, process_noise, samples, seed, "simulation"
+            fit, record, grid, inputs, start, sd, process_noise, samples, seed, "simulation"
         )
 
 
@@ -64,10 +65,15 @@ def forecast(
         both = torch.cat([u, ahead[:1]])
         y = _scaled(fit, past)
         y = torch.cat([y, torch.full_like(y[:1], torch.nan)])
-        assembly = assemble(beginning(fit, past), time_grid(time), both)
-        start = filtered_state(assembly, y)
+        system = beginning(fit, past)
+        start = filtered_state(assemble(system, time_grid(time), both), y)
         grid = time_grid(future.time)
-        return _forward(fit, future, grid, ahead, start, process_noise, samples, seed, "forecast")
+        # Noise that follows the output goes on from where the past has brought the output.
+        whole = np.append(past.time, past.time[-1] + gap + (future.time - future.time[0]))
+        sd = system.noise_sd(torch.cat([u, ahead]), time_grid(whole))[..., len(past) :, :]
+        return _forward(
+            fit, future, grid, ahead, start, sd, process_noise, samples, seed, "forecast"
+        )
 
 
 def filtered_state(assembly: Assembly, y: Tensor) -> JointState:
@@ -90,8 +96,8 @@ def predict(fit: Fit, record: Record, horizon: int, samples: int, seed: int) -> 
         raise invalid("record", expected="outputs to predict from", got="none")
     with torch.no_grad():
         inputs = scaled_inputs(fit.scaling, record)
-        assembly = assemble(beginning(fit, record), time_grid(record.time), inputs)
-        problem = assembly.with_outputs(_scaled(fit, record))
+        system, grid = beginning(fit, record), time_grid(record.time)
+        problem = assemble(system, grid, inputs).with_outputs(_scaled(fit, record))
         elements, _ = problem.elements()
         found = each(
             lambda b: smoothing.predict_ahead(problem.layout, elements[b], horizon), len(elements)
@@ -100,7 +106,9 @@ def predict(fit: Fit, record: Record, horizon: int, samples: int, seed: int) -> 
         mean = shift + scale * np.stack([one[0] for one in found])
         variance = scale**2 * np.stack([one[1] for one in found])
         generator = np.random.default_rng(seed)
-        noise = scale**2 * _noise_variance(fit.system, inputs, len(mean), generator)
+        noise = scale**2 * _noise_variance(
+            system, system.noise_sd(inputs, grid), len(mean), generator
+        )
     parts = {
         "parameters": mean.var(0),
         "state": variance.mean(0),
@@ -241,6 +249,7 @@ def _forward(
     grid: TimeGrid,
     inputs: Tensor,
     start: JointState,
+    sd: Tensor,
     process_noise: bool,
     samples: int,
     seed: int,
@@ -264,7 +273,7 @@ def _forward(
     mean = shift + scale * _flat(full.mean)
     variance = scale**2 * _flat(full.variance)
     generator = np.random.default_rng(seed)
-    noise = scale**2 * _noise_variance(system, inputs, len(mean), generator)
+    noise = scale**2 * _noise_variance(system, sd, len(mean), generator)
     parts = _decompose(system, at, on, scale)
     parts["measurement noise"] = noise.mean(0)
     # A joint sample of the last layer: its own draw where it is dynamic.
@@ -323,10 +332,12 @@ def _flat(x: Tensor) -> np.ndarray:
 
 
 def _noise_variance(
-    system: CascadeSystem, inputs: Tensor, count: int, generator: np.random.Generator
+    system: CascadeSystem, sd: Tensor, count: int, generator: np.random.Generator
 ) -> np.ndarray:
-    """Variance (count, n, n_y) of the noise for each component; a Student-t's is drawn."""
-    sd = system.noise.sd(system.driving(inputs))
+    """Variance (count, n, n_y) of noise of scale sd (*b, n, n_y) for each component.
+
+    A Student-t's is drawn.
+    """
     flat = sd.reshape(-1, *sd.shape[-2:]).numpy()
     variance = np.broadcast_to(flat, (len(flat), *flat.shape[1:])) ** 2
     variance = np.tile(variance, (-(-count // len(variance)), 1, 1))[:count]

@@ -288,5 +288,5 @@ def draw_outputs(system: CascadeSystem, time: Any, inputs: Tensor, shape: torch.
         signal = signal if level is None else signal + level
     else:
         signal = drawn.mean + drawn.variance.sqrt() * torch.randn_like(drawn.mean)
-    noise = system.noise.distribution(signal, system.noise.sd(system.driving(inputs)), None)
+    noise = system.noise.distribution(signal, system.noise_sd(inputs, grid), None)
     return noise.sample()

@@ -79,6 +79,8 @@ def test_noise_that_costs_the_forecasts_does_not_help() -> None:
     bad = judged_noise(gains, 1.5 * before, before)
     assert not bad.helps
     assert "forecasts worse by 50.0 +- 0.0" in bad.attempt.reason
+    assert judged_noise(gains, 1.04 * before, before).helps  # certain, and of no matter
+    assert not judged_noise(gains, 1.06 * before, before).helps
     wild = before.copy()
     wild[17] = 1e3  # of the noise, before and after
     assert judged_noise(gains, wild, wild).helps

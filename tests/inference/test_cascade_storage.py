@@ -107,6 +107,9 @@ MODELS = {
     "hammerstein-wiener": dgp.HammersteinWiener(1, pairs=1, inducing=(4, 5)),
     "student": dgp.Wiener(1, pairs=1, inducing=5, likelihood=dgp.StudentT(3.0)),
     "heteroscedastic": dgp.Wiener(1, pairs=1, inducing=5, likelihood=dgp.Heteroscedastic(4)),
+    "noise of the output": dgp.Wiener(
+        1, pairs=1, inducing=5, likelihood=dgp.Heteroscedastic(4, of="output")
+    ),
     "integrated": dgp.Wiener(1, pairs=1, inducing=5, initial_state="integrated"),
     "skips": dgp.Cascade(
         1,

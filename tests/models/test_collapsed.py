@@ -179,6 +179,7 @@ def test_collapsed_likelihood_is_the_average_of_explicit_ones(name):
         "skips",
         "heavy tails",
         "varying noise",
+        "noise of the output",
     ],
 )
 def test_simulated_outputs_have_the_explicit_model_s_moments(name):
@@ -186,6 +187,9 @@ def test_simulated_outputs_have_the_explicit_model_s_moments(name):
         model = dgp.Wiener(1, pairs=1, inducing=6, likelihood=dgp.StudentT(6.0))
     elif name == "varying noise":
         model = dgp.Wiener(1, pairs=1, inducing=6, likelihood=dgp.Heteroscedastic())
+    elif name == "noise of the output":
+        noise = dgp.Heteroscedastic(of="output")
+        model = dgp.Wiener(1, pairs=1, inducing=6, likelihood=noise)
     else:
         model = MODELS[name]()
     record = make_record(model.inputs, model.outputs)
@@ -225,6 +229,8 @@ def test_simulated_outputs_have_the_explicit_model_s_moments(name):
     (dgp.Gaussian(), "offset"),
     (dgp.Gaussian(), "noise_sd"),
     (dgp.Heteroscedastic(4), "log_noise_lengthscale"),
+    (dgp.Heteroscedastic(4, of="output"), "log_noise_values"),
+    (dgp.Heteroscedastic(4, of="output"), "g1_input_gain"),
 ])  # fmt: skip
 def test_any_site_alone_may_be_a_batch(noise, site):
     """As where all hyperparameters but one are held: nothing says which site brings particles."""

@@ -89,6 +89,10 @@ MODELS = {
     "varying noise": dgp.WienerHammerstein(
         1, pairs=2, inducing=7, process_noise=(False, True), likelihood=dgp.Heteroscedastic(5)
     ),
+    "noise of the output": dgp.WienerHammerstein(
+        1, pairs=2, inducing=7, process_noise=(False, True),
+        likelihood=dgp.Heteroscedastic(5, of="output"),
+    ),
 }  # fmt: skip
 
 

@@ -163,8 +163,9 @@ def given(model, record, values):
     return trace.nodes
 
 
+@pytest.mark.parametrize("of", ["inputs", "output"])
 @pytest.mark.parametrize("outputs", [1, 2])
-def test_varying_noise_is_one_function_for_explicit_and_collapsed_model(outputs):
+def test_varying_noise_is_one_function_for_explicit_and_collapsed_model(outputs, of):
     """Hammerstein: given f the outputs are exactly Gaussian, of the explicit model's variances."""
     modes = dgp.Modes([-0.5 + 2.0j], [[1.0 + 0.3j]], np.ones((outputs, 1)), [[0.2 + 0.1j]])
     record = simulate_record(modes, 0.2, n=30)
@@ -173,7 +174,7 @@ def test_varying_noise_is_one_function_for_explicit_and_collapsed_model(outputs)
         outputs=outputs,
         pairs=1,
         inducing=6,
-        likelihood=dgp.Heteroscedastic(inducing=5),
+        likelihood=dgp.Heteroscedastic(inducing=5, of=of),
         initial_state="zero",
     ).scaled_to(record)
     with torch.random.fork_rng():

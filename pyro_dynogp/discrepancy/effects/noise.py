@@ -19,7 +19,7 @@ from pyro_dynogp.discrepancy.noise_effects import (
     heteroscedastic_noise,
     process_noise,
 )
-from pyro_dynogp.layers.noise import Heteroscedastic, StudentT
+from pyro_dynogp.layers.noise import Driver, Heteroscedastic, StudentT
 from pyro_dynogp.record import Record
 
 
@@ -39,7 +39,7 @@ class HeavyTails(Effect):
 
 
 class HeteroscedasticNoise(Effect):
-    """Noise whose size depends on an input."""
+    """Noise whose size depends on an input or on the output."""
 
     name = "heteroscedastic noise"
     once = True
@@ -49,10 +49,11 @@ class HeteroscedasticNoise(Effect):
     test = staticmethod(heteroscedastic_noise)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
-        """Log standard deviation of the noise as a Gaussian process of the inputs."""
+        """Log standard deviation of the noise as a Gaussian process of what it follows."""
         if model.inputs == model.direct:
             return []
-        return [with_likelihood(model, Heteroscedastic())]
+        of: Driver = "output" if evidence.where["driver"] == "mean" else "inputs"
+        return [with_likelihood(model, Heteroscedastic(of=of))]
 
 
 class ProcessNoise(Effect):
