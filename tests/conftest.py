@@ -12,11 +12,12 @@ from threadpoolctl import threadpool_limits
 
 import pyro_dynogp as dgp
 
-# As many processes run tests as there are processors: more threads would wait for each other, here
-# and in the processes that tests start.
+# As many processes run tests as there are processors: more threads or processes would wait for each
+# other, here and in the kernels of notebooks. Where a test is about processes it asks for them.
 torch.set_num_threads(1)
 threadpool_limits(1)
 os.environ["OMP_NUM_THREADS"] = "1"
+os.environ["LOKY_MAX_CPU_COUNT"] = "1"
 settings.register_profile("deterministic", derandomize=True, deadline=None)
 settings.load_profile("deterministic")
 

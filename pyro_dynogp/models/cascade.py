@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import pyro
 import pyro.distributions as dist
@@ -19,7 +19,7 @@ from pyro_dynogp.distributions.process import LTIProcess
 from pyro_dynogp.layers.noise import Gaussian, Likelihood, Noise
 from pyro_dynogp.layers.static import StaticFunction, sample_static
 from pyro_dynogp.lti.covariance import state_covariance
-from pyro_dynogp.lti.grid import TimeGrid, time_grid
+from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import mean_response
 from pyro_dynogp.lti.state import ModalState
@@ -132,12 +132,12 @@ class CascadeSystem:
         direct = inputs[..., -self.direct.shape[-1] :] @ self.direct.mT
         return direct if level is None else level + direct
 
-    def undisturbed(self, inputs: Tensor, grid: TimeGrid) -> Tensor:
+    def undisturbed(self, inputs: Tensor, time: Any) -> Tensor:
         """Output (*b, n, n_y) that inputs (*b, n, n_u) alone cause, static layers at their mean.
 
         Dynamic layers start from the first state that is known of them, else at rest.
         """
-        signals = {INPUTS: self.driving(inputs)}
+        grid, signals = time_grid(time), {INPUTS: self.driving(inputs)}
         for one, layer in zip(self.wires, self.layers, strict=True):
             x = see(signals, one)
             if isinstance(layer, DynamicSystem):
@@ -151,11 +151,15 @@ class CascadeSystem:
         level = self.level(inputs)
         return output if level is None else output + level
 
-    def noise_sd(self, inputs: Tensor, grid: TimeGrid) -> Tensor:
-        """Scale (*b, n, n_y) of the measurement noise along scaled inputs (*b, n, n_u)."""
+    def noise_sd(self, inputs: Tensor, time: Any) -> Tensor:
+        """Scale (*b, n, n_y) of the measurement noise along scaled inputs (*b, n, n_u).
+
+        Args:
+            inputs: scaled. time: (n,) their times in the record's unit, or a `TimeGrid`.
+        """
         likelihood = self.noise.likelihood
         if likelihood.varying and likelihood.of == "output":
-            return self.noise.sd(self.undisturbed(inputs, grid))
+            return self.noise.sd(self.undisturbed(inputs, time))
         return self.noise.sd(self.driving(inputs))
 
     def after(self, states: Mapping[str, Tensor]) -> CascadeSystem:
@@ -435,7 +439,7 @@ class Cascade:
         if level is not None:
             mean = mean + level
         mean = shift + scale * mean
-        sd = scale * system.noise_sd(inputs, time_grid(record.time))
+        sd = scale * system.noise_sd(inputs, record.time)
         if not self.several_outputs:
             mean, sd = mean.squeeze(-1), sd.squeeze(-1)
         noise = system.noise.distribution(mean, sd, missing)

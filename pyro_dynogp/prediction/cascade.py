@@ -70,7 +70,7 @@ def forecast(
         grid = time_grid(future.time)
         # Noise that follows the output goes on from where the past has brought the output.
         whole = np.append(past.time, past.time[-1] + gap + (future.time - future.time[0]))
-        sd = system.noise_sd(torch.cat([u, ahead]), time_grid(whole))[..., len(past) :, :]
+        sd = system.noise_sd(torch.cat([u, ahead]), whole)[..., len(past) :, :]
         return _forward(
             fit, future, grid, ahead, start, sd, process_noise, samples, seed, "forecast"
         )
