@@ -32,7 +32,8 @@ WHOLE = (-4, -2, -1, 0, 1, 2, 4)
 INSTANTS, END = 60, 0.05
 # Channels of the largest share that are tried.
 CHANNELS = 6
-# A rule has no instant to choose: it wins unless another instant is this much better [nats].
+# A rule has no instant to choose: it wins unless another instant is this much better [nats]; so
+# do summers beside winters.
 PREFERENCE = 3.0
 
 
@@ -44,7 +45,7 @@ class Shifts:
         changes: (n, J) what each shift adds to the mean where it holds [output].
         shifts: (J,) [time unit]. channels: (J,) index of a share.
         edges: (I,) samples at which a shift may begin, to last to the end.
-        parts: (P, n) where rules of daylight saving have their hour.
+        parts: (P, n) where rules of daylight saving have their hour, or do not have it.
     """
 
     changes: np.ndarray
@@ -66,10 +67,11 @@ def clock_shift(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 
     """An input's time stamps that are off by a constant in part of the record.
 
     Where they are, the output has the input's share of the mean at another time: s(t + shift) in
-    place of s(t). Tried are shifts from a change at any instant to the end, and, with stamps, one
-    hour either way in the summers of the zones given and of the stamps' own. The effect has no free
-    size, which is what tells a shift from a change of gain. Inputs that are functions of the time
-    of day or week are one clock, whose share is what the mean repeats.
+    place of s(t). Tried are shifts from a change at any instant to the end, and, with stamps, in
+    the summers or the winters of the zones given and of the stamps' own (winters, where the model
+    was fitted to a summer, whose hour it takes for right). The effect has no free size, which is
+    what tells a shift from a change of gain. Inputs that are functions of the time of day or week
+    are one clock, whose share is what the mean repeats.
 
     Args:
         residuals: of one output (n,).
@@ -79,8 +81,8 @@ def clock_shift(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 
     Returns:
         where: channel (of several clocks the first), shift [time unit] (above zero: what the
         channel says at t + shift belongs to t, it is recorded too late), time of the (first) change
-        [time unit], and rule (the zone whose daylight saving it follows) where one fits as well as
-        any instant.
+        [time unit], and rule (the zone whose daylight saving it follows) with season ("summers" or
+        "winters": when the channel is off) where one fits as well as any instant.
 
     Raises:
         ValueError: where fewer than 30 samples are measured, there is no input that acts on the
@@ -113,7 +115,9 @@ def clock_shift(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 
     J, ruled = tried.changes.shape[1], len(parts) * tried.changes.shape[1]
     best = found.best
     if ruled and found.gains[:ruled].max() > found.gain - PREFERENCE:
-        best = int(np.argmax(found.gains[:ruled]))
+        # Daylight saving is an hour of summers, unless winters are that much better.
+        worse = PREFERENCE * np.array([season == "winters" for season, _ in rules])
+        best = int(np.argmax(found.gains[:ruled] - np.repeat(worse, J)))
     place, j = divmod(best, J)
     name, shift = names[tried.channels[j]], float(tried.shifts[j])
     share = shares[:, tried.channels[j]]
@@ -121,8 +125,9 @@ def clock_shift(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 
     where: dict[str, float | str] = {"channel": name[0]}
     if place < len(parts):
         at = int(np.flatnonzero(np.diff(parts[place]) != 0)[0]) + 1
-        where["rule"], effect = rules[place], tried.effect(best)
-        when = f"in the summers of {rules[place]}"
+        effect = tried.effect(best)
+        where["season"], where["rule"] = rules[place]
+        when = f"in the {where['season']} of {where['rule']}"
     else:
         first = int(tried.edges[place - len(parts)])
         at, shift, effect = _refined(r, found.whitener, nuisance, share, first, shift, tried.edges)
@@ -143,19 +148,20 @@ def clock_shift(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 
     )
 
 
-def _rules(r: Residuals, zones: Sequence[str]) -> tuple[list[str], np.ndarray]:
-    """Zones whose daylight saving changes within the record, each once; where it holds (P, n)."""
+def _rules(r: Residuals, zones: Sequence[str]) -> tuple[list[tuple[str, str]], np.ndarray]:
+    """Seasons of zones whose daylight saving changes within the record, each once; their (P, n)."""
     if r.stamps is None or r.stamps.tz is None:
         return [], np.zeros((0, len(r)))
-    rules: dict[bytes, tuple[str, np.ndarray]] = {}
+    rules: dict[bytes, tuple[tuple[str, str], np.ndarray]] = {}
     # Zones the caller names come first: of two with the same transitions that is the one meant.
     for zone in dict.fromkeys([*zones, *all_zones(r.stamps, ())]):
         local = in_zone(r.stamps, zone)
         ahead = local.tz_localize(None) - r.stamps.tz_convert("UTC").tz_localize(None)
-        part = np.asarray(ahead > ahead.min(), dtype=float)
-        if 0.0 < part.mean() < 1.0:
-            rules.setdefault(part.tobytes(), (zone, part))
-    return [z for z, _ in rules.values()], np.array([p for _, p in rules.values()]).reshape(
+        summer = np.asarray(ahead > ahead.min(), dtype=float)
+        if 0.0 < summer.mean() < 1.0:
+            for season, part in (("summers", summer), ("winters", 1.0 - summer)):
+                rules.setdefault(part.tobytes(), ((season, zone), part))
+    return [rule for rule, _ in rules.values()], np.array([p for _, p in rules.values()]).reshape(
         -1, len(r)
     )
 

@@ -242,6 +242,23 @@ def test_a_clock_may_be_wrong_for_all_inputs() -> None:
     assert all(isinstance(c, ShiftedClock) for c in together.channels)
 
 
+@pytest.mark.parametrize(("season", "off"), [("summers", [1, 0, 1, 0]), ("winters", [0, 1, 0, 1])])
+def test_a_clock_is_corrected_season_by_season(season: str, off: list[int]) -> None:
+    days = 700
+    start = pd.Timestamp("2023-06-01", tz="UTC")  # Berlin's summers end in October, begin in March
+    value = np.arange(float(days))
+    record = dgp.Record(
+        86400.0 * value, value, value, start=start, input_names=("a",), time_unit="s"
+    )
+    model = dgp.LinearDynamicGP(inputs=1, pairs=1)
+    where = {"channel": "a", "shift": 86400.0, "time": 0.0, "rule": "Europe/Berlin"}
+    found = spoken_for(effects.ClockShift(), 0.01, 0.1, season=season, **where)
+    (one,) = effects.ClockShift().extend(model, found.evidence, record)
+    read = one.check(record)[0].inputs[:, 0] - value
+    middles = [30, 200, 400, 570]  # July, December, July, December
+    assert read[middles].tolist() == off
+
+
 def test_a_calendar_moves_to_another_clock_instead_of_being_there_twice() -> None:
     record = two_inputs()
     there = Calendar("hour of day by weekend", "UTC", 4)

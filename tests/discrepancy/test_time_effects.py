@@ -230,7 +230,24 @@ class TestClockShift:
     def test_daylight_saving_is_found(self):
         found = clock_shift(daylight_saving(1), zones=("Europe/Berlin", MELBOURNE))
         assert found.p_value < 1e-4
-        assert found.where == {"channel": "hour", "rule": MELBOURNE, "shift": 1.0, "time": 352.0}
+        assert found.where == {
+            "channel": "hour", "rule": MELBOURNE, "season": "summers", "shift": 1.0, "time": 352.0
+        }  # fmt: skip
+
+    @pytest.mark.parametrize("shift", [2.0, -2.0])
+    def test_what_a_summer_takes_for_right_is_off_in_winters(self, shift):
+        # Steps of half an hour: an hour is two.
+        def effect(t, mean, u):
+            own = share(u[:, 0], 1.0)
+            return np.where(t >= 352.0, np.interp(t + 0.5 * shift, t, own) - own, 0.0)
+
+        r = residuals(3, 1200, step=0.5, effect=effect)
+        r = dataclasses.replace(r, stamps=stamps(1200, "30min"))
+        found = clock_shift(r, zones=(MELBOURNE,))
+        assert found.p_value < 1e-4
+        assert (found.where["rule"], found.where["season"]) == (MELBOURNE, "winters")
+        assert found.where["shift"] == pytest.approx(0.5 * shift)
+        assert "in the winters of Australia/Melbourne" in found.sentence
 
     def test_shift_of_the_whole_record_is_a_dead_time(self):
         def late(t, mean, u):

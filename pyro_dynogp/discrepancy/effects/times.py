@@ -165,7 +165,7 @@ class ClockShift(Effect):
         channel, shift = str(evidence.where["channel"]), number_of(evidence, "shift")
         times: tuple[float, ...] = (number_of(evidence, "time"),)
         if "rule" in evidence.where:
-            times = summers(record, str(evidence.where["rule"]))
+            times = seasons(record, str(evidence.where["rule"]), str(evidence.where["season"]))
         together = model
         prepared = model.check(record)[0]
         for name in prepared.input_names[: prepared.n_inputs - model.direct]:
@@ -174,17 +174,18 @@ class ClockShift(Effect):
         return [alone] if together == alone else [alone, together]
 
 
-def summers(record: Record, zone: str) -> tuple[float, ...]:
-    """Times at which a zone's daylight saving begins and, in turn, ends, over a record and a year.
+def seasons(record: Record, zone: str, season: str) -> tuple[float, ...]:
+    """Times at which a zone's summers (or winters) begin and, in turn, end.
 
-    Begins with the beginning of a summer, which may lie before the record.
+    Over a record and a year before and after it. The first is a beginning.
     """
     assert record.start is not None
     first = record.start + pd.Timedelta(record.time[0] - 366 * DAY, "s")
     hours = pd.date_range(first, periods=24 * int(record.duration / DAY + 2 * 366), freq="h")
     saving = np.array([bool(stamp.dst()) for stamp in hours.tz_convert(zone).to_pydatetime()])
-    changes = np.flatnonzero(np.diff(saving.astype(int))) + 1
-    if len(changes) and not saving[changes[0]]:
+    there = saving if season == "summers" else ~saving
+    changes = np.flatnonzero(np.diff(there.astype(int))) + 1
+    if len(changes) and not there[changes[0]]:
         changes = changes[1:]
     seconds = np.asarray((hours - record.start).total_seconds())
     return tuple(float(seconds[k]) for k in changes)
