@@ -367,6 +367,15 @@ def test_bad_options(options, message):
         dgp.Cascade(**{"inputs": 1, "layers": (Dynamic(),), **options})
 
 
+@pytest.mark.parametrize(("options", "message"), [
+    ({"inducing": 0}, "inducing: expected a whole number >= 1, got 0"),
+    ({"of": "time"}, "of: expected 'inputs' or 'output', got 'time'"),
+])  # fmt: skip
+def test_bad_noise(options, message):
+    with pytest.raises(ValueError, match=message):
+        dgp.Heteroscedastic(**options)
+
+
 def test_records_that_do_not_fit():
     model, record = case("Wiener")
     with pytest.raises(ValueError, match="expected 1 inputs, as the model has, got 2"):
