@@ -147,6 +147,7 @@ def run(folder: Path, names: Sequence[str] | None = None) -> str:
         "| record | not told | found | RMSE before, after | CRPS | 95 % | elpd | minutes |",
         "|---|---|---|---|---|---|---|---|",
     ]
+    folder.mkdir(parents=True, exist_ok=True)
     sentences = []
     for name in names or CASES:
         row = one(name)
