@@ -81,7 +81,7 @@ def regress(
     K = np.array([max(b.shape[1], 1) for b in bases], dtype=float)
     ends = np.cumsum([b.shape[1] for b in bases])
     free = series[:, there] - (series[:, there] @ Z) @ Z.T
-    own = _ratios(free @ free.T, free @ X, ends, samples)
+    own = _ratios((free @ free.T)[None], (free @ X)[None], ends, samples)[0]
     z = (own - K) / np.sqrt(2.0 * K)
     best = int(np.argmax(z))
     p_value = 1.0
@@ -161,15 +161,13 @@ def _lags(x: np.ndarray, p: int) -> np.ndarray:
 
 
 def _ratios(own: np.ndarray, cross: np.ndarray, ends: np.ndarray, samples: int) -> np.ndarray:
-    """Twice the log likelihood ratio of each variant, (*R, J).
+    """Twice the log likelihood ratio of each variant, (R, J).
 
     Args:
-        own: (*R, p + 1, p + 1) products of a series and its past, less what the nuisance explains.
-        cross: (*R, p + 1, K1 + ... + KJ) with orthonormal columns of each variant, likewise.
+        own: (R, p + 1, p + 1) products of a series and its past, less what the nuisance explains.
+        cross: (R, p + 1, K1 + ... + KJ) with orthonormal columns of each variant, likewise.
         ends: (J,) of them. samples: degrees of freedom.
     """
-    if own.ndim == 2:
-        return _ratios(own[None], cross[None], ends, samples)[0]
     past = own[:, 1:, 1:]
     # What the past explains of the present and of the columns; rounding must not make it singular.
     past = past + 1e-10 * np.trace(past, axis1=1, axis2=2)[:, None, None] * np.eye(past.shape[1])

@@ -61,6 +61,12 @@ class DynamicSystem:
             return ModalState(self.first_state, covariance)
         return ModalState(torch.zeros_like(modes.poles), covariance + self.past_inputs)
 
+    def mean(self, x: Tensor, time: Any) -> Tensor:
+        """Output (*b, n, w) that x (*b, n, d) alone causes, from the known first state or rest."""
+        driven = x if self.modes.inputs else None
+        value = mean_response(self.modes, time, driven, self.first_state).output
+        return value if self.modes.several_outputs else value.unsqueeze(-1)
+
     def after(self, standard: Tensor) -> DynamicSystem:
         """The system after past inputs that standard normal numbers (*b, 2P) describe."""
         return replace(self, first_state=initial_mean(self.past_inputs, standard))
@@ -79,6 +85,10 @@ class StaticSystem:
     function: StaticFunction
     support: Tensor | None = None
     residual: Tensor | None = None
+
+    def mean(self, x: Tensor, time: Any) -> Tensor:
+        """Mean of the function along x (*b, n, d): (*b, n, e), at whatever times."""
+        return self.function.mean(x)
 
     def __call__(self, x: Tensor) -> Tensor:
         """One function along x (*b, n, d): (*b, n, e)."""
@@ -139,14 +149,7 @@ class CascadeSystem:
         """
         grid, signals = time_grid(time), {INPUTS: self.driving(inputs)}
         for one, layer in zip(self.wires, self.layers, strict=True):
-            x = see(signals, one)
-            if isinstance(layer, DynamicSystem):
-                modes = layer.modes
-                driven = x if modes.inputs else None
-                value = mean_response(modes, grid, driven, layer.first_state).output
-                signals[one.name] = value if modes.several_outputs else value.unsqueeze(-1)
-            else:
-                signals[one.name] = layer.function.mean(x)
+            signals[one.name] = layer.mean(see(signals, one), grid)
         output = signals[self.wires[-1].name]
         level = self.level(inputs)
         return output if level is None else output + level

@@ -15,8 +15,7 @@ from torch import Tensor
 
 from pyro_dynogp.distributions.process import LTIProcess
 from pyro_dynogp.lti.grid import TimeGrid
-from pyro_dynogp.lti.response import mean_response
-from pyro_dynogp.models.cascade import CascadeSystem, DynamicSystem, see
+from pyro_dynogp.models.cascade import CascadeSystem, DynamicSystem, StaticSystem, see
 from pyro_dynogp.models.layers import INPUTS
 
 
@@ -48,21 +47,17 @@ def log_density(system: CascadeSystem, grid: TimeGrid, inputs: Tensor, y: Tensor
         y = y - level
     for one, layer in zip(system.wires, system.layers, strict=True):
         seen = see(signals, one)
-        if isinstance(layer, DynamicSystem):
+        if isinstance(layer, DynamicSystem) and one.last and not is_known(layer):
             driven = seen if layer.modes.inputs else None
-            if one.last and not is_known(layer):
-                process = LTIProcess(layer.modes, grid, driven, layer.prior_state())
-                several = layer.modes.several_outputs
-                if not several:
-                    y, sd = y.squeeze(-1), sd.squeeze(-1)
-                return process.observed(sd, varying=True).log_prob(y)
-            response = mean_response(layer.modes, grid, driven, layer.first_state).output
-            signals[one.name] = response if layer.modes.several_outputs else response.unsqueeze(-1)
-        elif one.last and not one.pathwise:
+            process = LTIProcess(layer.modes, grid, driven, layer.prior_state())
+            if not layer.modes.several_outputs:
+                y, sd = y.squeeze(-1), sd.squeeze(-1)
+            return process.observed(sd, varying=True).log_prob(y)
+        if isinstance(layer, StaticSystem) and one.last and not one.pathwise:
             signals[one.name], variance = layer.function.moments(seen)
             sd = (sd.square() + variance).sqrt()
         else:
-            signals[one.name] = layer.function.mean(seen)
+            signals[one.name] = layer.mean(seen, grid)
     missing = torch.isnan(y)
     error = (torch.where(missing, 0.0, y) - signals[system.wires[-1].name]) / sd
     each = -0.5 * error.square() - sd.log() - 0.5 * math.log(2.0 * math.pi)

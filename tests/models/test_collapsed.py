@@ -230,6 +230,11 @@ def test_simulated_outputs_have_the_explicit_model_s_moments(name):
     (dgp.Gaussian(), "noise_sd"),
     (dgp.Heteroscedastic(4), "log_noise_lengthscale"),
     (dgp.Heteroscedastic(4, of="output"), "log_noise_values"),
+    (dgp.Heteroscedastic(4, of="output"), "log_noise_constant"),
+    (dgp.Heteroscedastic(4, of="output"), "log_noise_output_scale"),
+    (dgp.Heteroscedastic(4, of="output"), "log_noise_lengthscale"),
+    (dgp.Heteroscedastic(4, of="output"), "log_noise_center"),
+    (dgp.Heteroscedastic(4, of="output"), "log_noise_half_width"),
     (dgp.Heteroscedastic(4, of="output"), "g1_input_gain"),
 ])  # fmt: skip
 def test_any_site_alone_may_be_a_batch(noise, site):

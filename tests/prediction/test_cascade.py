@@ -413,14 +413,14 @@ class TestNoise:
         draws["log_noise_values"] = torch.tensor([[[-2.0, -1.0, 1.0, 2.0]]], dtype=torch.float64)
         fit = fit_of(fit.model, draws, fit.scaling)
         record, _ = wiener_data(fit, n=300)
-        # By definition: the static function of g's mean response, through the noise's function.
+        # By definition: f's mean along g's mean response, through the noise's function.
         modes = fit.system.layer("g").modes
         g = dgp.LTIProcess(modes, record.time, scaled_inputs(fit.scaling, record)).mean
-        output = torch.tensor(saturation(g.numpy())).reshape(-1, 1)
+        output = fit.system.layer("f").function.mean(g.reshape(1, -1, 1))
         sd = 0.1 * fit.scaling.output_scale * fit.system.noise.log_sd.mean(output)[0].exp().numpy()
         assert sd.max() > 2 * sd.min()
         for prediction in (fit.predict(record), fit.simulate(record, samples=100)):
-            np.testing.assert_allclose(prediction.parts["measurement noise"], sd**2, rtol=0.05)
+            np.testing.assert_allclose(prediction.parts["measurement noise"], sd**2, rtol=1e-9)
         found = fit.forecast(record[:200], record[200:], samples=100)
         at_rest = fit.simulate(record[200:], samples=100).parts["measurement noise"]
         expected = fit.predict(record).parts["measurement noise"][200:]
