@@ -46,11 +46,12 @@ if TYPE_CHECKING:
         Wiener,
         WienerHammerstein,
     )
-    from pyro_dynogp.models.cascade import Cascade, CascadeSystem
+    from pyro_dynogp.models.cascade import Cascade
     from pyro_dynogp.models.collapsed import ObservedCascade
     from pyro_dynogp.models.layers import Dynamic, Static
     from pyro_dynogp.models.linear import LinearDynamicGP
     from pyro_dynogp.models.priors import TimeScale, sample_modes
+    from pyro_dynogp.models.systems import CascadeSystem
     from pyro_dynogp.prediction.prediction import Prediction
     from pyro_dynogp.prediction.scores import scores
     from pyro_dynogp.record import Record
@@ -62,7 +63,7 @@ __version__ = "0.1.0"
 _HOME = {
     "Calibration": "pyro_dynogp.criticism.calibration",
     "Cascade": "pyro_dynogp.models.cascade",
-    "CascadeSystem": "pyro_dynogp.models.cascade",
+    "CascadeSystem": "pyro_dynogp.models.systems",
     "Check": "pyro_dynogp.criticism.check",
     "Comparison": "pyro_dynogp.criticism.comparison",
     "ConditionedLTIProcess": "pyro_dynogp.distributions.conditioned",

@@ -24,7 +24,8 @@ from pyro_dynogp._errors import invalid
 from pyro_dynogp.distributions.process import ObservedLTIProcess
 from pyro_dynogp.distributions.trajectory import apply, split_missing
 from pyro_dynogp.lti.filtering import predict_k_steps
-from pyro_dynogp.models.collapsed import ObservedCascade, assemble
+from pyro_dynogp.models.assembly import assemble
+from pyro_dynogp.models.collapsed import ObservedCascade
 from pyro_dynogp.moments import recursion, smoothing
 from pyro_dynogp.moments.problem import each
 

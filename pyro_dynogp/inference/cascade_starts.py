@@ -16,11 +16,12 @@ from pyro_dynogp.layers.noise import TYPICAL
 from pyro_dynogp.layers.static import StaticFunction
 from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.lti.response import mean_response
-from pyro_dynogp.models.cascade import Cascade, DynamicSystem, scaled_inputs, see
-from pyro_dynogp.models.collapsed import assemble
+from pyro_dynogp.models.assembly import assemble
+from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.layers import INPUTS, Dynamic, Static, Wire
 from pyro_dynogp.models.linear import LinearDynamicGP
 from pyro_dynogp.models.priors import TimeScale
+from pyro_dynogp.models.systems import DynamicSystem, scaled_inputs, see
 from pyro_dynogp.moments import recursion, smoothing
 from pyro_dynogp.parallel import child_seeds
 from pyro_dynogp.record import Record

@@ -30,9 +30,11 @@ from pyro_dynogp.inference.result import Fit
 from pyro_dynogp.inference.svi import Trained, train
 from pyro_dynogp.layers.noise import Gaussian
 from pyro_dynogp.lti.grid import time_grid
-from pyro_dynogp.models.cascade import Cascade, scaled_inputs
-from pyro_dynogp.models.collapsed import assemble, outputs_with_gaps
+from pyro_dynogp.models.assembly import assemble
+from pyro_dynogp.models.cascade import Cascade
+from pyro_dynogp.models.collapsed import outputs_with_gaps
 from pyro_dynogp.models.layers import Dynamic
+from pyro_dynogp.models.systems import scaled_inputs
 from pyro_dynogp.parallel import child_seeds, parallel_map, seeded
 from pyro_dynogp.prediction.cascade import smoothed_layers
 from pyro_dynogp.record import Record

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from pyro_dynogp.models.cascade import Cascade, DynamicSystem
+from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.layers import Dynamic
+from pyro_dynogp.models.systems import DynamicSystem
 
 if TYPE_CHECKING:
     from pyro_dynogp.inference.result import Fit

@@ -9,9 +9,10 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-from pyro_dynogp.models.cascade import Cascade, CascadeSystem
+from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.collapsed import collapsed_of, outputs_with_gaps
 from pyro_dynogp.models.layers import Dynamic
+from pyro_dynogp.models.systems import CascadeSystem
 from pyro_dynogp.record import Record
 
 if TYPE_CHECKING:

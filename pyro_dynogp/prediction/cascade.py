@@ -13,8 +13,8 @@ from torch import Tensor
 from pyro_dynogp._errors import invalid
 from pyro_dynogp._tensors import as_tensor
 from pyro_dynogp.lti.grid import TimeGrid, time_grid
-from pyro_dynogp.models.cascade import CascadeSystem, DynamicSystem, scaled_inputs
-from pyro_dynogp.models.collapsed import Assembly, assemble
+from pyro_dynogp.models.assembly import Assembly, assemble
+from pyro_dynogp.models.systems import CascadeSystem, DynamicSystem, scaled_inputs
 from pyro_dynogp.moments import recursion, smoothing
 from pyro_dynogp.moments.problem import FilterProblem, each
 from pyro_dynogp.parallel import seeded

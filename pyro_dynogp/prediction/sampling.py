@@ -14,14 +14,9 @@ from pyro_dynogp.lti.grid import TimeGrid, time_grid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import mean_response
 from pyro_dynogp.lti.state import ModalState
-from pyro_dynogp.models.cascade import (
-    CascadeSystem,
-    DynamicSystem,
-    StaticSystem,
-    see,
-    support_points,
-)
+from pyro_dynogp.models.cascade import support_points
 from pyro_dynogp.models.layers import INPUTS, Static
+from pyro_dynogp.models.systems import CascadeSystem, DynamicSystem, StaticSystem, see
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,7 +269,7 @@ def known_start(system: CascadeSystem) -> Tensor:
 
 def draw_outputs(system: CascadeSystem, time: Any, inputs: Tensor, shape: torch.Size) -> Tensor:
     """Noisy scaled outputs (*shape, n, n_y) from inputs alone; shape ends in the batch shape."""
-    from pyro_dynogp.models.collapsed import assemble
+    from pyro_dynogp.models.assembly import assemble
 
     grid = time_grid(time)
     problem = assemble(system, grid, inputs).problem

@@ -24,8 +24,9 @@ from pyro_dynogp.inference.checkpoints import NOTHING_KEPT
 from pyro_dynogp.inference.maximum import Optimum
 from pyro_dynogp.inference.posterior import posterior_of
 from pyro_dynogp.inference.refit import optima_of, refit
+from pyro_dynogp.models.assembly import assemble
 from pyro_dynogp.models.cascade import Cascade
-from pyro_dynogp.models.collapsed import assemble, outputs_with_gaps
+from pyro_dynogp.models.collapsed import outputs_with_gaps
 from pyro_dynogp.moments import recursion, smoothing
 from pyro_dynogp.moments.problem import each
 from tests.conftest import simulate_record

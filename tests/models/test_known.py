@@ -9,7 +9,8 @@ import torch
 
 import pyro_dynogp as dgp
 from pyro_dynogp.inference.potential import Potential, denormals_flushed
-from pyro_dynogp.models import collapsed, known
+from pyro_dynogp.lti.grid import time_grid
+from pyro_dynogp.models import known
 from pyro_dynogp.models.layers import Dynamic, Static
 from tests.lti import oracles
 from tests.lti.oracles import tensor
@@ -53,7 +54,7 @@ def test_the_density_is_that_of_the_joint_gaussian(name, gaps):
         y[[1, 8]] = np.nan
         y[12, -1] = np.nan
     expected = joint.log_density(last, sd, y - offset)
-    grid = collapsed.time_grid(time)
+    grid = time_grid(time)
     found = known.log_density(system, grid, tensor(u), tensor(y))
     assert float(found) == pytest.approx(expected, rel=1e-9)
 

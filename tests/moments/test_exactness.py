@@ -8,7 +8,8 @@ import torch
 
 from pyro_dynogp.distributions.process import LTIProcess
 from pyro_dynogp.lti.grid import time_grid
-from pyro_dynogp.models.collapsed import ObservedCascade, assemble
+from pyro_dynogp.models.assembly import assemble
+from pyro_dynogp.models.collapsed import ObservedCascade
 from pyro_dynogp.models.layers import Dynamic, Static
 from pyro_dynogp.moments import recursion, smoothing
 from tests.lti import oracles

@@ -9,7 +9,7 @@ import torch
 from scipy.stats import kurtosis
 
 import pyro_dynogp as dgp
-from pyro_dynogp.models.cascade import scaled_inputs
+from pyro_dynogp.models.systems import scaled_inputs
 from pyro_dynogp.prediction.beginning import estimate
 from pyro_dynogp.prediction.linear import prior_process
 from tests.prediction.known import (

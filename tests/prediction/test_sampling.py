@@ -9,7 +9,7 @@ import torch
 
 import pyro_dynogp as dgp
 from pyro_dynogp.lti.grid import time_grid
-from pyro_dynogp.models.collapsed import assemble
+from pyro_dynogp.models.assembly import assemble
 from pyro_dynogp.models.layers import Dynamic, Static
 from pyro_dynogp.prediction import sampling
 from pyro_dynogp.prediction.sampling import (

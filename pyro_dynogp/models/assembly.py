@@ -1,0 +1,300 @@
+r"""A cascade written as a problem for the moment-matching filter.
+
+A signal is the sum of a known part, what the recorded inputs would cause by themselves, and of rows
+over the joint vector a = [x; f] of all modal states and all random static outputs. Known parts pass
+through the exact mean response; only the rest is filtered. A dynamic layer that sees a trajectory
+directly (skip connections, two dynamic layers in a row) does so through an identity function, for
+which moment matching is exact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from pyro_dynogp.layers.static import StaticFunction
+from pyro_dynogp.lti.covariance import complex_expm1, modal_covariance, real_covariance
+from pyro_dynogp.lti.fused import propagators
+from pyro_dynogp.lti.grid import TimeGrid
+from pyro_dynogp.lti.modes import Modes
+from pyro_dynogp.lti.response import mean_response
+from pyro_dynogp.models.filter_functions import Block, functions_of
+from pyro_dynogp.models.layers import INPUTS, Dynamic, Wire
+from pyro_dynogp.models.systems import CascadeSystem, DynamicSystem, StaticSystem
+from pyro_dynogp.moments.problem import FilterProblem, make_layout
+
+# What a channel is that is no static output.
+KNOWN, TRAJECTORY = -1, -2
+
+
+@dataclass(frozen=True, eq=False)
+class Signal:
+    """A signal inside the cascade.
+
+    Attributes:
+        known: (*b, n, w) what known inputs cause.
+        rows: (*b, w, A) over [x; f], None where the signal is known altogether.
+        outputs: for each channel the static output that it is, KNOWN, or TRAJECTORY.
+    """
+
+    known: Tensor
+    rows: Tensor | None
+    outputs: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Assembly:
+    """A cascade along a time axis: everything but the measured outputs.
+
+    Attributes:
+        problem: for the filter, with `y` missing everywhere.
+        signals: every layer's output, by name.
+        known_state: (*b, N) real state of all dynamic layers at the last sample that known inputs
+            cause, ordered as the filter's.
+    """
+
+    problem: FilterProblem
+    signals: dict[str, Signal]
+    known_state: Tensor
+
+    def with_outputs(self, y: Tensor) -> FilterProblem:
+        """The problem with scaled outputs y (*b, n, n_y), NaN where missing."""
+        return replace(self.problem, y=y)
+
+
+def count_states(system: CascadeSystem) -> int:
+    """N, the real states of all dynamic layers."""
+    layers = system.layers
+    return sum(2 * one.modes.pairs for one in layers if isinstance(one, DynamicSystem))
+
+
+def count_outputs(wires: Sequence[Wire]) -> int:
+    """E, the random static outputs, identities included."""
+    random: dict[str, str] = {INPUTS: "known"}
+    total = 0
+    for one in wires:
+        sources = [random[name] for name in one.sources]
+        if isinstance(one.layer, Dynamic):
+            total += one.channels if "trajectory" in sources else 0
+            random[one.name] = "trajectory"
+        elif any(kind != "known" for kind in sources):
+            total += one.layer.outputs
+            random[one.name] = "function"
+        else:
+            random[one.name] = "known"
+    return total
+
+
+class _Assembler:
+    """Walks through the layers once; holds what has been found so far."""
+
+    def __init__(
+        self, system: CascadeSystem, grid: TimeGrid, inputs: Tensor, process_noise: bool
+    ) -> None:
+        self.system, self.grid, self.process_noise = system, grid, process_noise
+        self.batch = system.batch_shape
+        self.states = count_states(system)
+        self.total = self.states + count_outputs(system.wires)
+        driving = system.driving(inputs)
+        self.level = system.level(inputs)
+        self.signals = {INPUTS: Signal(driving, None, (KNOWN,) * driving.shape[-1])}
+        self.blocks: list[Block] = []
+        self.modes: list[Modes] = []
+        self.gains: list[Tensor] = []  # (*b, m, P, E) complex, held static outputs to modal state
+        self.covariances: list[Tensor] = []
+        self.last_states: list[Tensor] = []
+        self.pairs_before = 0
+        self.outputs_before = 0
+        self.extra: Tensor | None = None
+
+    def expand(self, x: Tensor, event: int) -> Tensor:
+        return x.expand(self.batch + x.shape[x.dim() - event :])
+
+    def sources(self, one: Wire) -> Signal:
+        parts = [self.signals[name] for name in one.sources]
+        known = torch.cat([self.expand(p.known, 2) for p in parts], -1)
+        outputs = tuple(o for p in parts for o in p.outputs)
+        if all(p.rows is None for p in parts):
+            return Signal(known, None, outputs)
+        zeros = [
+            known.new_zeros((*self.batch, p.known.shape[-1], self.total))
+            if p.rows is None
+            else self.expand(p.rows, 2)
+            for p in parts
+        ]
+        return Signal(known, torch.cat(zeros, -2), outputs)
+
+    def unit_rows(self, first: int, count: int) -> Tensor:
+        rows = torch.zeros(count, self.total, dtype=torch.float64)
+        rows[torch.arange(count), self.states + first + torch.arange(count)] = 1.0
+        return rows
+
+    def add_block(self, signal: Signal, function: StaticFunction | None, last: bool) -> Signal:
+        assert signal.rows is not None
+        block = Block(signal.rows, signal.known, function, with_variance=last)
+        self.blocks.append(block)
+        first, count = self.outputs_before, block.outputs
+        self.outputs_before += count
+        known = signal.known.new_zeros((*self.batch, len(self.grid), count))
+        return Signal(
+            known, self.expand(self.unit_rows(first, count), 2), tuple(range(first, first + count))
+        )
+
+    def static(self, one: Wire, layer: StaticSystem) -> Signal:
+        seen = self.sources(one)
+        if seen.rows is not None:
+            return self.add_block(seen, layer.function, not one.pathwise)
+        known = layer(seen.known)
+        if one.last:
+            self.extra = layer.function.variance(seen.known)
+        return Signal(known, None, (KNOWN,) * one.layer.outputs)
+
+    def dynamic(self, one: Wire, layer: DynamicSystem) -> Signal:
+        seen = self.sources(one)
+        known = seen.known
+        if TRAJECTORY in seen.outputs:  # a trajectory feeds the layer: hold it through an identity
+            held = self.add_block(seen, None, False)
+            seen = Signal(held.known, held.rows, held.outputs)
+            known = held.known
+        modes = layer.modes if self.process_noise else layer.modes.without_process_noise()
+        responded = mean_response(
+            modes, self.grid, known if modes.inputs else None, layer.first_state
+        )
+        response = responded.output
+        response = response if modes.several_outputs else response.unsqueeze(-1)
+        self.last_states.append(self.expand(responded.state, 1))
+        gain = propagators(modes, self.grid.steps)[1].unsqueeze(-1) * modes.B.unsqueeze(-3)
+        E = self.total - self.states
+        select = torch.zeros(modes.inputs, E, dtype=torch.complex128)
+        for i, o in enumerate(seen.outputs):
+            if o >= 0:
+                select[i, o] = 1.0
+        self.gains.append(self.expand(gain @ select, 3))
+        self.modes.append(modes)
+        self.covariances.append(layer.prior_state(self.process_noise).covariance)  # type: ignore
+        rows = self.state_rows(modes)
+        if seen.rows is not None:
+            rows = rows + modes.D @ seen.rows
+        self.pairs_before += modes.pairs
+        return Signal(self.expand(response, 2), rows, (TRAJECTORY,) * modes.outputs)
+
+    def state_rows(self, modes: Modes) -> Tensor:
+        C = self.expand(modes.C, 2)
+        half = self.states // 2
+        before = C.real.new_zeros((*C.shape[:-1], self.pairs_before))
+        after = C.real.new_zeros((*C.shape[:-1], half - self.pairs_before - modes.pairs))
+        static = C.real.new_zeros((*C.shape[:-1], self.total - self.states))
+        return torch.cat([before, 2.0 * C.real, after, before, -2.0 * C.imag, after, static], -1)
+
+    def layer_states(self, place: int) -> Tensor:
+        """Where the real state [Re x; Im x] of a dynamic layer stands in the joint one."""
+        start = sum(m.pairs for m in self.modes[:place])
+        own = torch.arange(start, start + self.modes[place].pairs)
+        return torch.cat([own, own + self.states // 2])
+
+    def joint(self, parts: Sequence[Tensor], event: int) -> Tensor:
+        """Block-diagonal matrices from those of each dynamic layer (*b, ..., 2P, 2P)."""
+        lead = (len(self.grid.steps),) if event == 3 else ()
+        out = torch.zeros((*self.batch, *lead, self.states, self.states), dtype=torch.float64)
+        for place, part in enumerate(parts):
+            index = self.layer_states(place)
+            out[..., index[:, None], index] = self.expand(part, event)
+        return out
+
+    def function_is_measured(self, output: Signal) -> bool:
+        """Whether the only output is a tabulated function of one signal."""
+        if output.rows is None or output.outputs != (self.outputs_before - 1,):
+            return False
+        last = self.blocks[-1]
+        return last.function is not None and last.channels == last.outputs == 1
+
+    def finish(self, noise_sd: Tensor) -> Assembly:
+        steps = self.grid.steps
+        m = len(steps)
+        phi = [self.expand(propagators(one, steps)[0], 2) for one in self.modes]
+        nothing = torch.zeros((*self.batch, m, 0), dtype=torch.complex128)
+        joined = torch.cat(phi, -1) if phi else nothing
+        E = self.total - self.states
+        gains = torch.cat(self.gains, -2) if self.gains else nothing.new_zeros((m, 0, E))
+        output = self.signals[self.system.wires[-1].name]
+        n, n_y = len(self.grid), output.known.shape[-1]
+        offset = output.known
+        if self.level is not None:
+            offset = offset + self.level
+        H = output.rows
+        if H is None:
+            H = torch.zeros(n_y, self.total, dtype=torch.float64)
+        variance = noise_sd.square()
+        if self.extra is not None:
+            variance = variance + self.extra
+        share, multiple = self.system.noise.likelihood.components()
+        forms, values = functions_of(self.blocks)
+        blocks = self.blocks
+        problem = FilterProblem(
+            layout=make_layout(
+                self.grid.step_index,
+                [b.channels for b in blocks],
+                [b.outputs for b in blocks],
+                forms,
+                share,
+                multiple,
+                measured=self.function_is_measured(output),
+            ),
+            re=joined.real,
+            im=joined.imag,
+            Q=self.joint([step_noises(one, steps) for one in self.modes], 3),
+            gamma=torch.cat([gains.real, gains.imag], -2),
+            m0=torch.zeros(self.states, dtype=torch.float64),
+            P0=self.joint(self.covariances, 2),
+            G=torch.cat([b.rows for b in blocks], -2)
+            if blocks
+            else torch.zeros(0, self.total, dtype=torch.float64),
+            offset=torch.cat([self.expand(b.known, 2) for b in blocks], -1)
+            if blocks
+            else torch.zeros(n, 0, dtype=torch.float64),
+            H=H,
+            y_offset=offset,
+            y=torch.full((n, n_y), torch.nan, dtype=torch.float64),
+            R=variance,
+            **values,
+        )
+        known = torch.cat(self.last_states, -1) if self.last_states else nothing[..., 0, :0]
+        return Assembly(problem, self.signals, torch.cat([known.real, known.imag], -1))
+
+
+def assemble(
+    system: CascadeSystem, grid: TimeGrid, inputs: Tensor, *, process_noise: bool = True
+) -> Assembly:
+    """Write a cascade as a problem for the filter.
+
+    Args:
+        system: the layers given their parameters, batch shape *b.
+        grid: time axis. inputs: (n, n_u) scaled.
+        process_noise: False for the deterministic system from an unknown first state.
+
+    Raises:
+        ValueError: where a static layer of several channels has a kernel that is not radial.
+    """
+    walk = _Assembler(system, grid, inputs, process_noise)
+    for one, layer in zip(system.wires, system.layers, strict=True):
+        if isinstance(layer, DynamicSystem):
+            walk.signals[one.name] = walk.dynamic(one, layer)
+        else:
+            walk.signals[one.name] = walk.static(one, layer)
+    return walk.finish(system.noise_sd(inputs, grid))
+
+
+def step_noises(modes: Modes, steps: Tensor) -> Tensor:
+    """Covariance (*b, m, 2P, 2P) that process noise adds to [Re x; Im x] within each step."""
+    lam = modes.poles
+    hermitian, symmetric = modal_covariance(modes)
+    d = steps[:, None, None]
+    plus = (lam.unsqueeze(-1) + lam.conj().unsqueeze(-2)).unsqueeze(-3)
+    same = (lam.unsqueeze(-1) + lam.unsqueeze(-2)).unsqueeze(-3)
+    return real_covariance(
+        -hermitian.unsqueeze(-3) * complex_expm1(plus * d),
+        -symmetric.unsqueeze(-3) * complex_expm1(same * d),
+    )

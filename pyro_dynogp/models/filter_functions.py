@@ -1,0 +1,150 @@
+"""Static functions as the moment-matching filter takes them.
+
+A function of one channel is a table of its moments, one of several is weights of a radial kernel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pyro_dynogp._errors import invalid
+from pyro_dynogp._tensors import broadcast
+from pyro_dynogp.layers.static import StaticFunction
+from pyro_dynogp.moments.functions import KERNELS
+from pyro_dynogp.moments.problem import TABLE
+
+# Points of the table of a static function of one channel.
+GRID = 801
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """One static function inside the filter: its inputs, and how it is evaluated."""
+
+    rows: Tensor
+    known: Tensor
+    function: StaticFunction | None  # None: the identity
+    with_variance: bool
+
+    @property
+    def channels(self) -> int:
+        """Inputs of the function."""
+        return int(self.rows.shape[-2])
+
+    @property
+    def outputs(self) -> int:
+        """Outputs of the function."""
+        return self.channels if self.function is None else int(self.function.whitened.shape[-2])
+
+
+def functions_of(blocks: Sequence[Block]) -> tuple[list[int], dict[str, Tensor]]:
+    """Form of each static function, and the tensors that `Values` keeps of it."""
+    widest = max((b.channels for b in blocks), default=1)
+    radial = [b for b in blocks if b.function is not None and b.channels > 1]
+    M = max((b.function.whitened.shape[-1] for b in radial if b.function), default=1)
+    forms: list[int] = []
+    columns: dict[str, list[Tensor]] = {}
+    for block in blocks:
+        form, values = _function(block, M, widest)
+        forms.append(form)
+        for name, value in values.items():
+            columns.setdefault(name, []).append(value)
+    if not blocks:
+        return [], {name: torch.zeros(shape, dtype=torch.float64) for name, shape in _EMPTY.items()}
+    joined = {}
+    for name, parts in columns.items():
+        event = len(_EMPTY[name])
+        batch = broadcast(*(p.shape[: p.dim() - event] for p in parts))
+        joined[name] = torch.cat(
+            [p.expand(batch + p.shape[p.dim() - event :]) for p in parts], -event
+        )
+    return forms, joined
+
+
+# Shapes without any static layer; all are joined along the first of these dimensions.
+_EMPTY: dict[str, tuple[int, ...]] = {
+    "table_mean": (0, 4),
+    "table_variance": (0, 4),
+    "low": (0,),
+    "spacing": (0,),
+    "weight": (0, 1),
+    "Z": (0, 1, 1),
+    "inverse": (0, 1),
+    "constant": (0,),
+    "slope": (0, 1),
+}
+
+
+def _function(block: Block, M: int, widest: int) -> tuple[int, dict[str, Tensor]]:
+    d, e = block.channels, block.outputs
+
+    def zeros(*shape: int) -> Tensor:
+        return torch.zeros(shape, dtype=torch.float64)
+
+    values = {
+        "table_mean": zeros(e, GRID),
+        "table_variance": zeros(e, GRID),
+        "low": zeros(1),
+        "spacing": zeros(1) + 1.0,
+        "weight": zeros(e, M),
+        "Z": zeros(1, M, widest),
+        "inverse": zeros(1, widest),
+        "constant": zeros(e),
+        "slope": zeros(e, widest),
+    }
+    function = block.function
+    if function is None:
+        values["slope"] = torch.eye(d, widest, dtype=torch.float64)
+        return KERNELS["rbf"], values
+    if d == 1:
+        low, high = table_range(function)
+        share = torch.linspace(0.0, 1.0, GRID, dtype=torch.float64)
+        grid = low.unsqueeze(-1) + (high - low).unsqueeze(-1) * share
+        mean, variance = function.moments(grid.unsqueeze(-1))
+        values["table_mean"] = mean.mT
+        if block.with_variance:
+            values["table_variance"] = variance.mT
+        values["low"] = low.unsqueeze(-1)
+        values["spacing"] = ((high - low) / (GRID - 1)).unsqueeze(-1)
+        return TABLE, values
+    radial = function.kernel.radial
+    if radial is None:
+        raise invalid(
+            "kernel",
+            expected="RBF or Matern (with ARD) for a layer of several channels that is "
+            "integrated out",
+            got="another kernel",
+            advice="Use integrate='none' and another guide ('gauss-markov'), which take any.",
+        )
+    name, lengthscale = radial
+    weight = function.weights
+    if function.kernel.radial_variance is not None:
+        weight = weight * function.kernel.radial_variance[..., None, None]
+    pad = torch.nn.functional.pad
+    count = weight.shape[-1]
+    values["weight"] = pad(weight, (0, M - count))
+    values["Z"] = pad(function.locations, (0, widest - d, 0, M - count)).unsqueeze(-3)
+    values["inverse"] = pad(1.0 / lengthscale, (0, widest - d)).unsqueeze(-2)
+    values["constant"] = function.constant
+    if function.slope is not None:
+        values["slope"] = pad(function.slope, (0, widest - d))
+    return KERNELS[name], values
+
+
+def table_range(function: StaticFunction) -> tuple[Tensor, Tensor]:
+    """Range (*b) of a function's table: where it has inducing points, and well beyond.
+
+    It moves with the parameters, and gradients know: a table that did not would leave steps in the
+    likelihood.
+    """
+    z = function.locations.squeeze(-1)
+    low, high = z.amin(-1), z.amax(-1)
+    margin = 0.5 * (high - low)
+    if function.kernel.radial is not None:
+        # A function is back at its prior mean within some lengthscales.
+        margin = margin + 3.0 * function.kernel.radial[1].squeeze(-1)
+    return low - margin, high + margin
