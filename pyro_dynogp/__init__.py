@@ -36,8 +36,9 @@ if TYPE_CHECKING:
     from pyro_dynogp.inference.result import Fit
     from pyro_dynogp.inference.storage import load
     from pyro_dynogp.inference.svi import TrainingDivergedError
+    from pyro_dynogp.layers.functions import StaticFunction
     from pyro_dynogp.layers.noise import Gaussian, Heteroscedastic, Likelihood, StudentT
-    from pyro_dynogp.layers.static import StaticFunction, sample_static, static_gp
+    from pyro_dynogp.layers.static import sample_static, static_gp
     from pyro_dynogp.lti.modes import Modes
     from pyro_dynogp.lti.state import ModalState
     from pyro_dynogp.models.architectures import (
@@ -102,7 +103,7 @@ _HOME = {
     "SimulationBasedCalibration": "pyro_dynogp.criticism.rank_results",
     "Stack": "pyro_dynogp.criticism.comparison",
     "Static": "pyro_dynogp.models.layers",
-    "StaticFunction": "pyro_dynogp.layers.static",
+    "StaticFunction": "pyro_dynogp.layers.functions",
     "StudentT": "pyro_dynogp.layers.noise",
     "TimeScale": "pyro_dynogp.models.priors",
     "TrainingDivergedError": "pyro_dynogp.inference.svi",

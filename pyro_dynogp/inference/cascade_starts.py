@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.inference.starts import random_poles
+from pyro_dynogp.layers.functions import StaticFunction
 from pyro_dynogp.layers.noise import TYPICAL
-from pyro_dynogp.layers.static import StaticFunction
 from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.lti.response import mean_response
 from pyro_dynogp.models.assembly import assemble

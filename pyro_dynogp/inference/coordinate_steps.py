@@ -9,7 +9,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from pyro_dynogp.layers.static import StaticFunction
+from pyro_dynogp.layers.functions import StaticFunction
 
 # Unconstrained values of sites (*s, *unconstrained) by name.
 Parts = dict[str, Tensor]

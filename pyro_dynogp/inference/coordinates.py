@@ -33,7 +33,7 @@ from pyro_dynogp.inference.coordinate_steps import (
     affine,
 )
 from pyro_dynogp.inference.potential import Potential, Site, parts
-from pyro_dynogp.layers.static import StaticFunction
+from pyro_dynogp.layers.functions import StaticFunction
 from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.layers import Dynamic, Static, Wire
 

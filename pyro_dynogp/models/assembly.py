@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from pyro_dynogp.layers.static import StaticFunction
+from pyro_dynogp.layers.functions import StaticFunction
 from pyro_dynogp.lti.covariance import complex_expm1, modal_covariance, real_covariance
 from pyro_dynogp.lti.fused import propagators
 from pyro_dynogp.lti.grid import TimeGrid

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from pyro_dynogp._errors import invalid
 from pyro_dynogp.channels import Channel
+from pyro_dynogp.layers.functions import StaticFunction
 from pyro_dynogp.layers.noise import Gaussian, Likelihood
-from pyro_dynogp.layers.static import StaticFunction, sample_static
+from pyro_dynogp.layers.static import sample_static
 from pyro_dynogp.models.collapsed import observe_collapsed
 from pyro_dynogp.models.explicit import observe_explicit
 from pyro_dynogp.models.layers import Dynamic, Layer, Static, Wire, wire

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pyro_dynogp._errors import invalid
 from pyro_dynogp._tensors import broadcast
-from pyro_dynogp.layers.static import StaticFunction
+from pyro_dynogp.layers.functions import StaticFunction
 from pyro_dynogp.moments.functions import KERNELS
 from pyro_dynogp.moments.problem import TABLE
 

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from pyro_dynogp._errors import invalid
 from pyro_dynogp._tensors import as_tensor, broadcast
+from pyro_dynogp.layers.functions import StaticFunction
 from pyro_dynogp.layers.noise import Noise
-from pyro_dynogp.layers.static import StaticFunction
 from pyro_dynogp.lti.covariance import state_covariance
 from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.lti.modes import Modes

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from pyro_dynogp.layers.functions import StaticFunction
 from pyro_dynogp.layers.kernels import SampledKernel, _default_form
 from pyro_dynogp.layers.noise import Gaussian, Noise
-from pyro_dynogp.layers.static import StaticFunction
 from pyro_dynogp.models.layers import Dynamic, wire
 from pyro_dynogp.models.systems import CascadeSystem, DynamicSystem, StaticSystem
 from tests.lti import oracles

@@ -7,9 +7,9 @@ import pytest
 import torch
 from scipy.stats import norm
 
+from pyro_dynogp.layers.functions import StaticFunction
 from pyro_dynogp.layers.kernels import SampledKernel, _default_form
 from pyro_dynogp.layers.noise import Gaussian, Noise
-from pyro_dynogp.layers.static import StaticFunction
 from pyro_dynogp.models.collapsed import ObservedCascade
 from pyro_dynogp.models.layers import Dynamic, Static, wire
 from pyro_dynogp.models.systems import CascadeSystem, DynamicSystem, StaticSystem

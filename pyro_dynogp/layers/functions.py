@@ -1,0 +1,196 @@
+r"""A static function: a Gaussian process given its whitened inducing values.
+
+A function with prior mean mu, kernel s^2 k and inducing values at M locations Z is written in
+whitened inducing values v ~ N(0, I):
+
+    K_zz = L L',      u = mu(Z) + s L v,      alpha = s L^-T v,
+    E[f(x) | v] = mu(x) + k(x, Z) alpha,
+    Cov[f(x), f(x') | v] = s^2 R(x, x'),      R(x, x') = k(x, x') - k(x, Z) K_zz^-1 k(Z, x').
+
+The outputs of a layer share kernel and locations and are independent given them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from pyro_dynogp._errors import invalid
+from pyro_dynogp._tensors import broadcast
+from pyro_dynogp.layers.kernels import SampledKernel
+from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
+
+# Added to the diagonal of a matrix that is factored, as a share of the kernel's mean variance; the
+# second where the first does not suffice. Coincident locations need it: K_zz is then singular.
+JITTER = 1e-8
+LARGER_JITTER = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class StaticFunction:
+    """A Gaussian process given its whitened inducing values and all its parameters.
+
+    The batch shapes *b of the attributes and of points x need only broadcast. K_zz is factored
+    once, with 1e-8 of the kernel's mean variance added to its diagonal; an element of the batch
+    where that fails gets 1e-6.
+
+    Attributes:
+        kernel: k.
+        locations: Z (*b, M, d).
+        whitened: v (*b, e, M).
+        output_scale: s (*b, e), standard deviations that multiply the kernel's.
+        constant: (*b, e), constant part of the prior mean.
+        slope: (*b, e, d), slopes of the prior mean; None for a constant mean.
+        name: what error messages call it.
+
+    Raises:
+        ValueError: if shapes do not fit together, or points have another number of channels.
+        NotPositiveDefiniteError: on use, if K_zz cannot be factored even with the larger jitter.
+    """
+
+    kernel: SampledKernel
+    locations: Tensor
+    whitened: Tensor
+    output_scale: Tensor
+    constant: Tensor
+    slope: Tensor | None = None
+    name: str = "static function"
+
+    def __post_init__(self) -> None:
+        e, (M, d) = self.outputs, self.locations.shape[-2:]
+        _check_shape("locations", self.locations, M, self.kernel.channels)
+        _check_shape("whitened", self.whitened, e, M)
+        _check_shape("output_scale", self.output_scale, e)
+        _check_shape("constant", self.constant, e)
+        if self.slope is not None:
+            _check_shape("slope", self.slope, e, d)
+
+    @property
+    def channels(self) -> int:
+        """Number of channels d."""
+        return self.locations.shape[-1]
+
+    @property
+    def outputs(self) -> int:
+        """Number of outputs e."""
+        return self.whitened.shape[-2]
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """Batch shape *b that all attributes broadcast to."""
+        pairs = [(self.locations, 2), (self.whitened, 2), (self.output_scale, 1)]
+        pairs += [(self.constant, 1)] + ([] if self.slope is None else [(self.slope, 2)])
+        return broadcast(self.kernel.batch_shape, *(x.shape[: x.dim() - k] for x, k in pairs))
+
+    @cached_property
+    def root(self) -> Tensor:
+        """Cholesky factor L (*b, M, M)."""
+        K = self.kernel(self.locations, self.locations)
+        level = K.diagonal(dim1=-2, dim2=-1).mean(-1)
+        return _cholesky(K, level, f"{self.name}: the covariance of the inducing values")
+
+    @property
+    def inducing_values(self) -> Tensor:
+        """Inducing values u (*b, e, M)."""
+        return self.prior_mean(self.locations).mT + self.output_scale.unsqueeze(-1) * (
+            self.whitened @ self.root.mT
+        )
+
+    @cached_property
+    def weights(self) -> Tensor:
+        """Weights alpha (*b, e, M), scale included: mean(x) = prior_mean(x) + k(x, Z) alpha'."""
+        return self.output_scale.unsqueeze(-1) * _solve(self.root.mT, self.whitened.mT, True).mT
+
+    def prior_mean(self, x: Tensor) -> Tensor:
+        """Prior mean mu (*b, n, e) at points x (*b, n, d)."""
+        self._check_points("x", x)
+        constant = self.constant.unsqueeze(-2)
+        if self.slope is not None:
+            return constant + x @ self.slope.mT
+        return constant + x.new_zeros((x.shape[-2], 1))
+
+    def mean(self, x: Tensor) -> Tensor:
+        """Conditional mean E[f(x) | v] (*b, n, e) at points x (*b, n, d)."""
+        return self.prior_mean(x) + self.kernel(x, self.locations) @ self.weights.mT
+
+    def variance(self, x: Tensor) -> Tensor:
+        """Conditional variance Var[f(x) | v] (*b, n, e) at points x (*b, n, d), at least zero."""
+        return self.moments(x)[1]
+
+    def moments(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """`mean` and `variance` at points x (*b, n, d), for the cost of one kernel evaluation."""
+        prior_mean = self.prior_mean(x)
+        K = self.kernel(x, self.locations)
+        explained = _solve(self.root, K.mT).square().sum(-2)
+        share = (self.kernel.diagonal(x) - explained).clamp_min(0.0)
+        variance = share.unsqueeze(-1) * self.output_scale.square().unsqueeze(-2)
+        mean = prior_mean + K @ self.weights.mT
+        return mean, variance.expand(broadcast(mean.shape, variance.shape))
+
+    def path(self, x: Tensor, residual: Tensor, support: Tensor) -> Tensor:
+        """Values (*b, n, e) at x (*b, n, d) of one function drawn from f | v (Matheron's rule).
+
+        The part of f that v leaves open, f - E[f | v], is drawn jointly at the support points and
+        interpolated to x by its own conditional mean; what it could still vary between them is
+        dropped, so that the support has to be dense compared with the lengthscale. Equal x get
+        equal values; where x is among the support points the joint distribution is exact (up to
+        1e-8 of the kernel's variance).
+
+        Args:
+            x: points.
+            residual: (*b, e, K) standard normal innovations.
+            support: (*b, K, d) support points.
+        """
+        self._check_points("x", x)
+        self._check_points("support", support)
+        _check_shape("residual", residual, self.outputs, support.shape[-2])
+        A = _solve(self.root, self.kernel(self.locations, support))
+        K = self.kernel(support, support)
+        level = K.diagonal(dim1=-2, dim2=-1).mean(-1)
+        root = _cholesky(K - A.mT @ A, level, f"{self.name}: the covariance of the residual")
+        # Coefficients of k(x, support), and of k(x, Z) for what the support shares with Z.
+        own = _solve(root.mT, residual.mT, True)
+        shared = _solve(self.root.mT, A @ own, True)
+        scale = self.output_scale.unsqueeze(-2)
+        drawn = self.kernel(x, support) @ (scale * own)
+        given = self.kernel(x, self.locations) @ (self.weights.mT - scale * shared)
+        return self.prior_mean(x) + given + drawn
+
+    def _check_points(self, argument: str, x: Tensor) -> None:
+        if x.dim() < 2 or x.shape[-1] != self.channels:
+            raise invalid(
+                argument,
+                expected=f"shape (..., n, {self.channels})",
+                got=f"shape {tuple(x.shape)}",
+            )
+
+
+def _check_shape(argument: str, x: Tensor, *shape: int) -> None:
+    if tuple(x.shape[x.dim() - len(shape) :]) != shape or x.dim() < len(shape):
+        sizes = ", ".join(str(size) for size in shape)
+        raise invalid(argument, expected=f"shape (..., {sizes})", got=f"shape {tuple(x.shape)}")
+
+
+def _solve(triangle: Tensor, right: Tensor, upper: bool = False) -> Tensor:
+    return torch.linalg.solve_triangular(triangle, right, upper=upper)
+
+
+def _cholesky(K: Tensor, level: Tensor, what: str) -> Tensor:
+    """Lower Cholesky factor of K (*b, n, n) plus jitter, a share of the variance level (*b)."""
+    diagonal = level[..., None, None] * torch.eye(K.shape[-1], dtype=K.dtype, device=K.device)
+    root, failed = torch.linalg.cholesky_ex(K + JITTER * diagonal)
+    if bool(failed.any()):
+        # Only where it failed: an element's result must not depend on the rest of its batch.
+        jitter = torch.where(failed > 0, K.new_tensor(LARGER_JITTER), K.new_tensor(JITTER))
+        root, failed = torch.linalg.cholesky_ex(K + jitter[..., None, None] * diagonal)
+    if bool(failed.any()) or not bool(root.isfinite().all()):
+        finite = "finite" if bool(K.isfinite().all()) else "not finite"
+        raise NotPositiveDefiniteError(
+            f"{what} is not positive definite, even with {LARGER_JITTER} of the kernel's variance "
+            f"added to its diagonal (its entries are {finite}). Lengthscales far from the scale of "
+            "the inputs or points far apart are the usual causes."
+        )
+    return root
