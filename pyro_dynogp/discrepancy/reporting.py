@@ -1,0 +1,151 @@
+"""Open the last block, once, and put a report together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pyro_dynogp.criticism.comparison import block_standard_error
+from pyro_dynogp.discrepancy import words
+from pyro_dynogp.discrepancy.confirm import Confirmed
+from pyro_dynogp.discrepancy.effects import Effect
+from pyro_dynogp.discrepancy.evidence import Residuals
+from pyro_dynogp.discrepancy.parameters import limits_of, parameters_of
+from pyro_dynogp.discrepancy.report import Attempt, FoundEffect, Report
+from pyro_dynogp.discrepancy.rounds import Rounds, Stopwatch
+from pyro_dynogp.discrepancy.search import Found
+from pyro_dynogp.discrepancy.trials import one_step_density
+from pyro_dynogp.parallel import parallel_map
+from pyro_dynogp.prediction.clock import joined
+from pyro_dynogp.prediction.scores import scores
+from pyro_dynogp.record import Record
+
+if TYPE_CHECKING:
+    from pyro_dynogp.inference.result import Fit
+
+SCORES = ("rmse", "mae", "nrmse", "crps", "coverage_50", "coverage_95")
+
+
+def report_of(
+    base: Fit,
+    extended: Fit,
+    rounds: Rounds,
+    accepted: Sequence[tuple[Found, Confirmed]],
+    reported: Sequence[Found],
+    attempts: Sequence[Attempt],
+    warnings: Sequence[str],
+    left: bool,
+    watch: Stopwatch,
+) -> Report:
+    """Open block C, once."""
+    data = rounds.data
+    forecasts = [
+        one.forecast(data.known, data.sealed, seed=rounds.seed) for one in (base, extended)
+    ]
+    before, after = ({k: _mean(v) for k, v in scores(f, data.sealed).items() if k in SCORES}
+                     for f in forecasts)  # fmt: skip
+    whole = joined(data.known, data.sealed)
+    sealed = np.zeros(len(whole), dtype=bool)
+    sealed[len(data.known) :] = True
+    densities = [one_step_density(one, whole)[sealed] for one in (base, extended)]
+    there = np.isfinite(densities[0])
+    gain = densities[1][there] - densities[0][there]
+    watch.stop("scores of the last block")
+    tests = _tested([f for f, _ in accepted], (base, extended), whole, sealed, rounds)
+    watch.stop("residual tests of the last block")
+    effects = [_effect(f, c, extended, data.known) for f, c in accepted]
+    watch.stop("numbers of the effects")
+    return Report(
+        effects=(*effects, *(_only_reported(f) for f in reported)),
+        outcome=_outcome(bool(accepted), left),
+        before=before,
+        after=after,
+        elpd_gain=float(gain.sum()),
+        elpd_gain_error=block_standard_error(gain)[0],
+        fit=extended,
+        base=base,
+        attempts=tuple(attempts),
+        warnings=tuple(warnings),
+        data=data.sentence,
+        tests=tests,
+        sealed=data.sealed,
+        known=data.known,
+        forecast_before=forecasts[0],
+        forecast_after=forecasts[1],
+        model_before=words.describe(base.model),
+        model_after=words.describe(extended.model),
+        seconds=dict(watch.seconds),
+    )
+
+
+def _outcome(added: bool, left: bool) -> str:
+    if added:
+        return "effects added, structure left" if left else "effects added"
+    return "structure left, cause unknown" if left else "nothing missing"
+
+
+def _tested(
+    found: Sequence[Found], fits: Sequence[Fit], whole: Record, sealed: np.ndarray, rounds: Rounds
+) -> dict[str, tuple[float, float]]:
+    """Smallest p-value of each effect's tests on C, of the model before and after."""
+    effects = list({f.effect.name: f.effect for f in found}.values())
+    if not effects:
+        return {}
+    residuals = [rounds.residuals(one, whole, sealed) for one in fits]
+
+    def smallest(task: tuple[Effect, list[Residuals]]) -> float:
+        effect, parts = task
+        p = [e.p_value for one in parts for e in effect.detect(one, seed=rounds.seed)]
+        return min(p, default=1.0)  # nothing left to test
+
+    tasks = [(effect, parts) for effect in effects for parts in residuals]
+    p = parallel_map(
+        smallest, tasks, workers=rounds.workers, progress=rounds.progress, description="last tests"
+    )
+    return {effect.name: (p[2 * k], p[2 * k + 1]) for k, effect in enumerate(effects)}
+
+
+def _effect(found: Found, confirmed: Confirmed, extended: Fit, record: Record) -> FoundEffect:
+    attempt = confirmed.attempt
+    assert attempt is not None
+    assert confirmed.model is not None
+    own = [one for one in confirmed.model.channels if one not in confirmed.before.channels]
+    lines = [words.in_words(one) for one in own] or words.describe(confirmed.model)
+    parameters = parameters_of(extended, own, record)
+    parameters |= limits_of(extended, found.evidence, record)
+    return FoundEffect(
+        name=found.effect.name,
+        sentence=found.effect.sentence(found.evidence, confirmed.model),
+        p_value=found.evidence.p_value,
+        q_value=found.q_value,
+        gain=attempt.gain,
+        gain_error=attempt.gain_error,
+        size=found.evidence.size,
+        parameters=parameters,
+        block="; ".join(lines),
+        curve=found.evidence.curve,
+        ties=confirmed.ties,
+        experiment=words.experiment(found.effect.name, confirmed.ties),
+    )
+
+
+def _only_reported(found: Found) -> FoundEffect:
+    return FoundEffect(
+        name=found.effect.name,
+        sentence=found.evidence.sentence,
+        p_value=found.evidence.p_value,
+        q_value=found.q_value,
+        gain=0.0,
+        gain_error=0.0,
+        size=found.evidence.size,
+        parameters={},
+        block="",
+        curve=found.evidence.curve,
+    )
+
+
+def _mean(value: Any) -> float:
+    """A score, averaged over outputs where there are several."""
+    return float(np.mean(value))

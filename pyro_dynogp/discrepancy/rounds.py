@@ -1,0 +1,126 @@
+"""What the rounds of closing a loop have in common: data, residuals, tests, and the time taken."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pyro_dynogp.discrepancy.blocks import Blocks, shared
+from pyro_dynogp.discrepancy.confirm import Confirmed, confirm
+from pyro_dynogp.discrepancy.effects import Effect
+from pyro_dynogp.discrepancy.evidence import Residuals
+from pyro_dynogp.discrepancy.extend import (
+    used_channels,
+    without_process_noise,
+)
+from pyro_dynogp.discrepancy.gate import structure_left
+from pyro_dynogp.discrepancy.refits import quick_fit
+from pyro_dynogp.discrepancy.residuals import residuals_of
+from pyro_dynogp.discrepancy.search import Found, look, merged
+from pyro_dynogp.discrepancy.trials import without
+from pyro_dynogp.record import Record
+
+if TYPE_CHECKING:
+    from pyro_dynogp.inference.result import Fit
+
+# Families of effects that go with inputs.
+OF_INPUTS = ("paths", "shapes")
+
+
+class Stopwatch:
+    """Seconds by stage."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def stop(self, stage: str) -> None:
+        """Add the time since the last stop to a stage."""
+        now = time.perf_counter()
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._last
+        self._last = now
+
+
+class Rounds:
+    """One after the other on the same data, with the same options.
+
+    Attributes:
+        data: blocks. names: of candidate channels. held_out: (n,) samples of the known blocks
+            that no fit of a round sees.
+        seed, level, tries, effects, workers, progress: as of `close_loop`.
+    """
+
+    def __init__(
+        self,
+        data: Blocks,
+        names: Sequence[str],
+        seed: int,
+        level: float,
+        tries: int,
+        effects: Sequence[Effect],
+        workers: int | None,
+        progress: bool,
+    ) -> None:
+        self.data, self.names, self.seed = data, names, seed
+        self.held_out = data.held_out
+        self.level, self.tries, self.effects = level, tries, effects
+        self.workers, self.progress = workers, progress
+
+    def residuals(self, fit: Fit, record: Record, held_out: np.ndarray) -> list[Residuals]:
+        """Of every output, with the candidates that the model does not use."""
+        taken = used_channels(fit.model)
+        free = [name for name in self.names if name not in taken]
+        return [
+            residuals_of(fit, record, held_out=held_out, candidates=free, output=a, seed=self.seed)
+            for a in range(record.n_outputs)
+        ]
+
+    def look(
+        self, fit: Fit, known: Collection[str]
+    ) -> tuple[list[Residuals], list[Found], list[str]]:
+        """Residuals, evidence of all effects but those that are known, what was not tested.
+
+        Process noise can take up what inputs do, and a simulation with it explains less than it
+        could: what goes with inputs is looked for in the residuals of a fit without it, too.
+        """
+        residuals = self.residuals(fit, self.data.known, self.held_out)
+        effects = [e for e in self.effects if not (e.once and e.name in known)]
+        options: dict[str, Any] = {
+            "seed": self.seed, "workers": self.workers, "progress": self.progress,
+        }  # fmt: skip
+        found, skipped = look(residuals, effects, **options)
+        plain = without_process_noise(fit.model)
+        if plain != fit.model:
+            structural = [e for e in effects if e.family in OF_INPUTS and e.score == "forecast"]
+            training = without(self.data.known, self.held_out)
+            again = quick_fit(plain, training, self.seed, fit)
+            others = self.residuals(again, self.data.known, self.held_out)
+            found = merged(found, look(others, structural, **options)[0])
+        return residuals, found, skipped
+
+    def confirm(self, chosen: Any, current: Fit, number: int) -> Confirmed:
+        """Refit what is chosen in a round, and judge it."""
+        return confirm(
+            chosen, current, self.data.known, self.held_out, number=number,
+            seed=self.seed, level=self.level, workers=self.workers, progress=self.progress,
+        )  # fmt: skip
+
+    def hold_out_less(self, winner: Found) -> bool:
+        """Give parts of B to the fit where an effect begins there; whether that was needed."""
+        if not winner.effect.localised or (self.held_out != self.data.held_out).any():
+            return False
+        begin = self.data.known.time[int(np.argmax(self.held_out))]
+        if float(winner.evidence.where.get("time", -np.inf)) < begin:
+            return False
+        self.held_out = shared(self.held_out)
+        return True
+
+    def structure(self, residuals: Sequence[Residuals], found: Sequence[Found]) -> bool:
+        """Whether anything is left: by the omnibus test, or by one of the others, all paid for."""
+        if min((f.q_value for f in found), default=1.0) < self.level:
+            return True
+        omnibus = min(structure_left(one, seed=self.seed)[0] for one in residuals)
+        return min(1.0, omnibus * len(residuals)) < self.level
