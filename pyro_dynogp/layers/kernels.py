@@ -1,16 +1,9 @@
-r"""Any GPyTorch kernel as a function of tensors, its hyperparameters being Pyro sample sites.
+"""Any GPyTorch kernel as a function of tensors, its hyperparameters being Pyro sample sites.
 
-The functions of the distance that matter most are evaluated by plain formulas,
-
-    r^2 = sum_c ((x_c - x'_c) / l_c)^2,
-    rbf       exp(-r^2 / 2)
-    matern12  exp(-r)
-    matern32  (1 + sqrt(3) r) exp(-sqrt(3) r)
-    matern52  (1 + sqrt(5) r + 5/3 r^2) exp(-sqrt(5) r)
-
-as are scales, sums and products of kernels; everything else is the kernel's own `forward`. The
-formulas are GPyTorch's, without its hand-written derivative, which takes the first derivative for
-a constant: a Hessian through it would be silently wrong.
+The functions of the distance that matter most are evaluated by `pyro_dynogp.layers.radial`, as are
+scales, sums and products of them; everything else is the kernel's own `forward`. GPyTorch's Matern
+kernels have a hand-written derivative that takes the first derivative for a constant: a Hessian
+through it would be silently wrong.
 """
 
 from __future__ import annotations
@@ -32,9 +25,8 @@ from torch.distributions import constraints as supports
 
 from pyro_dynogp._errors import invalid
 from pyro_dynogp._tensors import broadcast
+from pyro_dynogp.layers.radial import check_lengthscale, function_of_distance
 
-# What keeps the derivative of r finite at r = 0.
-TINY = 1e-30
 MATERN = {0.5: "matern12", 1.5: "matern32", 2.5: "matern52"}
 # Kernels whose GPyTorch code takes parameters with more leading dimensions than they were made
 # with; of all others one batch element is evaluated at a time.
@@ -118,7 +110,7 @@ class SampledKernel:
         if form is None or base.active_dims is not None:
             return None
         lengthscale = self.values[prefix + "raw_lengthscale"].squeeze(-2)
-        _check_lengthscale(lengthscale, self.channels)
+        check_lengthscale(lengthscale, self.channels)
         return form, lengthscale.expand(*lengthscale.shape[:-1], self.channels), variance
 
     def _sizes(self) -> list[tuple[Tensor, int]]:
@@ -135,7 +127,7 @@ class SampledKernel:
                 )
         found = self._radial()
         if found is not None:
-            return _scaled(_distance_function(*found[:2], x1, x2), found[2], x2 is None)
+            return _scaled(function_of_distance(*found[:2], x1, x2), found[2], x2 is None)
         whole = _Evaluation(self.kernel)
         modules = (m for m in self.kernel.modules() if isinstance(m, kernels.Kernel))
         if all(type(module) in BATCHED for module in modules):
@@ -188,7 +180,7 @@ def _dense(kernel: kernels.Kernel, x1: Tensor, x2: Tensor | None, select: bool =
         return total
     form = _form(kernel)
     if form is not None:
-        return _distance_function(form, kernel.lengthscale.squeeze(-2), x1, x2)
+        return function_of_distance(form, kernel.lengthscale.squeeze(-2), x1, x2)
     if x2 is not None:
         return to_dense(kernel.forward(x1, x2))
     diagonal = to_dense(kernel.forward(x1, x1, diag=True))
@@ -207,51 +199,6 @@ def _scaled(K: Tensor, variance: Tensor | None, diagonal: bool) -> Tensor:
     if variance is None:
         return K
     return K * (variance[..., None] if diagonal else variance[..., None, None])
-
-
-def _check_lengthscale(lengthscale: Tensor, channels: int) -> None:
-    if lengthscale.shape[-1] not in (1, channels):
-        raise invalid(
-            "kernel",
-            expected=f"one lengthscale, or one for each of {channels} channels",
-            got=f"{lengthscale.shape[-1]} lengthscales",
-            advice="Set ard_num_dims to the number of channels that the kernel sees.",
-        )
-
-
-def _distance_function(form: str, lengthscale: Tensor, x1: Tensor, x2: Tensor | None) -> Tensor:
-    """Kernel of unit variance (*b, n, m), or its diagonal where x2 is None.
-
-    Args:
-        form: name of the function.
-        lengthscale: (*b, d) or (*b, 1). x1: (*b, n, d). x2: (*b, m, d).
-    """
-    _check_lengthscale(lengthscale, x1.shape[-1])
-    if x2 is None:
-        shape = broadcast(lengthscale.shape[:-1], x1.shape[:-2]) + x1.shape[-2:-1]
-        return x1.new_ones(shape)
-    inverse = lengthscale.reciprocal().unsqueeze(-2)
-    # Differences, not |x|^2 - 2 x'y + |y|^2: near points would lose their distance to rounding.
-    difference = (x1 * inverse).unsqueeze(-2) - (x2 * inverse).unsqueeze(-3)
-    # Where nothing is differentiated memory is used again: of many draws it is what this costs.
-    end = "" if difference.requires_grad else "_"
-
-    def then(x: Tensor, operation: str, *args: float | Tensor) -> Tensor:
-        found: Tensor = getattr(x, operation + end)(*args)
-        return found
-
-    square = then(difference, "square")
-    square = square.squeeze(-1) if square.shape[-1] == 1 else square.sum(-1)
-    if form == "rbf":
-        return then(then(square, "mul", -0.5), "exp")
-    a = then(then(square, "add", TINY), "sqrt")
-    if form == "matern12":
-        return then(then(a, "neg"), "exp")
-    a = then(a, "mul", math.sqrt(3.0 if form == "matern32" else 5.0))
-    decay = then(a.neg(), "exp")
-    if form == "matern32":
-        return then(then(a, "add", 1.0), "mul", decay)
-    return then(a.square() / 3.0 + a + 1.0, "mul", decay)
 
 
 @lru_cache

@@ -271,17 +271,6 @@ def test_second_derivatives(name):
     assert torch.autograd.gradgradcheck(total, values)
 
 
-@pytest.mark.parametrize("channels", [1, 2])
-@pytest.mark.parametrize("nu", [0.5, 1.5, 2.5, None])
-def test_memory_used_again_changes_nothing(nu, channels):
-    _, ours = sampled(RBFKernel() if nu is None else MaternKernel(nu), channels=channels)
-    x = points(5, channels)
-    free = ours(x, x[:3])  # nothing is differentiated
-    other = x.clone().requires_grad_()
-    assert torch.equal(ours(other, other[:3]).detach(), free)
-    assert torch.equal(x, other)
-
-
 def test_coincident_points_have_finite_derivatives():
     _, ours = sampled(None)
     x = torch.zeros(3, 2, dtype=torch.float64, requires_grad=True)
