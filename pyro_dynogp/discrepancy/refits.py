@@ -108,12 +108,14 @@ def race(
     cut = max(FEWEST, round(LEADING * len(found)))
     begun = [one for one in found[:cut] if _begins(one.model, base)]
     rest = [one for one in found if not any(one is other for other in begun)]
-    if isinstance(base.model, Cascade):
-        begun = [_further(one, seed) for one in begun]
-    else:
-        more = [(one.model, one.records, [dict(one.mode)]) for one in begun]
-        begun = _side_by_side(more, MORE_STEPS, seed)
-    return sorted([*begun, *rest], key=energy), problems
+    further = [_further(one, seed) for one in begun if isinstance(one.model, Cascade)]
+    more = [
+        (one.model, one.records, [dict(one.mode)])
+        for one in begun
+        if not isinstance(one.model, Cascade)
+    ]
+    further += _side_by_side(more, MORE_STEPS, seed)
+    return sorted([*further, *rest], key=energy), problems
 
 
 def energy(fit: Fit) -> float:
@@ -136,11 +138,18 @@ def _scaled(model: Model, record: Record) -> tuple[Model, tuple[Record, ...]]:
 
 
 def _begins(model: Model, base: Fit) -> bool:
-    """Whether a model begins where its base is: linear ones do, cascades of the same layers."""
-    before = base.model
+    """Whether a model begins where its base is: linear ones do, and cascades of the same layers.
+
+    A linear model is the same as a cascade of one dynamic layer.
+    """
     if isinstance(model, Cascade):
-        return isinstance(before, Cascade) and len(before.layers) == len(model.layers)
-    return not isinstance(before, Cascade)
+        return len(model.layers) == _count(base.model)
+    return not isinstance(base.model, Cascade)
+
+
+def _count(model: Model) -> int:
+    """Number of layers."""
+    return len(model.layers) if isinstance(model, Cascade) else 1
 
 
 def _side_by_side(beginnings: Sequence[_Beginning], steps: int, seed: int) -> list[Fit]:

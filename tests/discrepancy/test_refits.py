@@ -10,7 +10,7 @@ import pytest
 import pyro_dynogp as dgp
 from pyro_dynogp.channels import Delayed, Recorded
 from pyro_dynogp.discrepancy import effects, refits
-from pyro_dynogp.discrepancy.extend import with_channel, without_process_noise
+from pyro_dynogp.discrepancy.extend import as_cascade, with_channel, without_process_noise
 from pyro_dynogp.discrepancy.refits import energy, quick_fit, race
 from pyro_dynogp.discrepancy.search import candidates_of
 from tests.discrepancy.made import coloured
@@ -84,6 +84,22 @@ def test_a_cascade_that_is_no_larger_goes_on_from_its_base(record):
     assert replace(found[0].model, scaling=None) == delayed[1]
     assert energy(found[0]) < energy(start) - 50.0
     assert without_process_noise(found[0].model) == found[0].model
+
+
+def test_other_noise_goes_on_from_a_linear_base(record, monkeypatch):
+    outliers = record.outputs.copy()
+    outliers[20::25] += 2.0
+    spoilt = record.with_outputs(outliers)
+    base = quick_fit(later(LATE), spoilt, 0)
+    monkeypatch.delattr(refits, "_fresh")  # another climb from the beginning is not needed
+    robust = replace(as_cascade(later(LATE)), likelihood=dgp.StudentT())
+    plain = as_cascade(later(LATE))
+    found, _ = race([plain, robust], spoilt, base, 0)
+    first, second = found
+    assert replace(first.model, scaling=None) == robust
+    # The same model under another name is as probable; twelve outliers are not normal.
+    assert energy(second) == pytest.approx(energy(base), abs=1.0)
+    assert energy(first) < energy(base) - 100.0
 
 
 def test_a_variant_is_tried_for_one_channel_only():
