@@ -132,7 +132,9 @@ def clock_shift(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 
         first = int(tried.edges[place - len(parts)])
         at, shift, effect = _refined(r, found.whitener, nuisance, share, first, shift, tried.edges)
         when = f"from {instant(r, at)}"
-    where |= {"shift": shift, "time": float(r.time[at])}
+    where |= {"shift": shift, "time": float(r.time[at]), "time_unit": r.time_unit}
+    if r.stamps is not None:
+        where |= {"stamp": r.stamps[at].isoformat(), "zone": str(r.stamps.tz)}
     late = "late" if shift > 0 else "early"
     size = float(np.std(effect))
     return Evidence(

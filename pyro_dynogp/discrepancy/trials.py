@@ -116,18 +116,21 @@ def _kept(trial: Trial, training: Record) -> Fit:
         return _best_ahead(trial, training)
     base = trial.base
     (model, *others), start = trial.models, base
-    if others:
+    if others or _finer(trial, model, training, 0):
         found, problems = race(trial.models, training, base, trial.seed)
         if not found:
             raise ValueError(problems[0])
         start = found[0]
         for times in range(REFINEMENTS):
-            finer: Sequence[Model] = []
-            if trial.refine is not None:
-                finer = trial.refine(_unscaled(start), training, times)
+            finer = _finer(trial, _unscaled(start), training, times)
             start = min([start, *race(finer, training, start, trial.seed)[0]], key=energy)
         model = _unscaled(start)
     return quick_fit(model, training, trial.seed, start, poles=poles_of(base))
+
+
+def _finer(trial: Trial, model: Model, training: Record, times: int) -> Sequence[Model]:
+    """Variants close to a model."""
+    return [] if trial.refine is None else trial.refine(model, training, times)
 
 
 def _best_ahead(trial: Trial, training: Record) -> Fit:

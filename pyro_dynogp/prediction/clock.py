@@ -31,7 +31,9 @@ def one_record(fit: Fit, record: Record) -> Record:
 
 
 def following(fit: Fit, past: Record, future: Record) -> tuple[Record, Record]:
-    """Two records prepared together: a channel of the second may reach back into the first.
+    """Two records prepared together: a channel may reach back into the first, or ahead.
+
+    Inputs of the future are given; a clock that is late takes those of the past from there.
 
     Raises:
         ValueError: as `one_record` and `gap_between`.
@@ -46,8 +48,11 @@ def following(fit: Fit, past: Record, future: Record) -> tuple[Record, Record]:
         one.with_outputs(np.zeros((len(one), 0)), names=(), units=()) for one in (past, future)
     )
     both = joined(first, second, future.time[0] - past.time[-1] - gap)
-    inputs = fit.model.check(both)[0].inputs[len(past) :]
-    return alone[0], dataclasses.replace(alone[1], inputs=inputs)
+    inputs = np.split(fit.model.check(both)[0].inputs, [len(past)])
+    before, after = (
+        dataclasses.replace(one, inputs=u) for one, u in zip(alone, inputs, strict=True)
+    )
+    return before, after
 
 
 def joined(first: Record, second: Record, shift: float = 0.0) -> Record:

@@ -12,7 +12,13 @@ from pyro_dynogp.channels import Calendar, ShiftedClock, Sinusoid, Step, Trend, 
 from pyro_dynogp.channels.clock import DAY
 from pyro_dynogp.discrepancy.calendar_effects import calendar
 from pyro_dynogp.discrepancy.clock_effects import clock_shift
-from pyro_dynogp.discrepancy.effects.base import Effect, centre_of, listed, number_of
+from pyro_dynogp.discrepancy.effects.base import (
+    Effect,
+    centre_of,
+    listed,
+    number_of,
+    unit_of,
+)
 from pyro_dynogp.discrepancy.evidence import Evidence, Residuals
 from pyro_dynogp.discrepancy.extend import (
     Model,
@@ -35,6 +41,9 @@ CALENDAR_PARTS = {
     "hour of day by weekday/weekend": "hour of day by weekend",
     "season": "time of year",
 }
+
+# Samples by which the instant of a shifted clock is moved to refine it, first and then.
+FARTHEST = ((7, 14, 21, 28, 35), (1, 2, 3))
 
 
 class Drift(Effect):
@@ -173,6 +182,55 @@ class ClockShift(Effect):
         alone = with_channel(model, ShiftedClock(channel, shift, times))
         return [alone] if together == alone else [alone, together]
 
+    def sentence(self, evidence: Evidence, model: Model) -> str:
+        """The shift and its instant as refits have them."""
+        last = model.channels[-1]
+        assert isinstance(last, ShiftedClock)
+        if len(last.times) > 1:
+            return evidence.sentence
+        (at,), where = last.times, evidence.where
+        same = [c for c in model.channels if isinstance(c, ShiftedClock) and c.times == last.times]
+        names = " and ".join(repr(c.channel) for c in same)
+        if "stamp" in where:
+            stamp = pd.Timestamp(str(where["stamp"])).tz_convert(str(where["zone"]))
+            stamp += pd.Timedelta(at - number_of(evidence, "time"), "s")
+            when = f"{stamp:%Y-%m-%d %H:%M:%S %Z}"
+        else:
+            when = f"time {at:.5g}{unit_of(evidence)}"
+        late = "late" if last.shift > 0 else "early"
+        return (
+            f"The clock of {names} is {abs(last.shift):.4g}{unit_of(evidence)} {late} from {when}."
+        )
+
+    def refine(self, model: Model, record: Record, times: int) -> Sequence[Model]:
+        """Other instants and shifts nearby, some samples away; what a rule says stays."""
+        last = model.channels[-1]
+        assert isinstance(last, ShiftedClock)
+        if len(last.times) > 1:
+            return []
+        step, coarse = record.sampling_time, FARTHEST[times]
+        offsets = sorted({sign * k for k in coarse for sign in (-1, 0, 1)})
+        moved = {
+            (last.times[0] + i * step, last.shift + k * step) for i in offsets for k in range(-3, 4)
+        }
+        inside = [
+            (time, shift)
+            for time, shift in sorted(moved)
+            if record.time[0] < time < record.time[-1] and shift
+            if (time, shift) != (last.times[0], last.shift)
+        ]
+        same = [c for c in model.channels if isinstance(c, ShiftedClock) and c.times == last.times]
+        return [
+            replace(
+                model,
+                channels=tuple(
+                    replace(c, shift=shift, times=(time,)) if c in same else c
+                    for c in model.channels
+                ),
+            )
+            for time, shift in inside
+        ]
+
 
 def seasons(record: Record, zone: str, season: str) -> tuple[float, ...]:
     """Times at which a zone's summers (or winters) begin and, in turn, end.
@@ -180,12 +238,15 @@ def seasons(record: Record, zone: str, season: str) -> tuple[float, ...]:
     Over a record and a year before and after it. The first is a beginning.
     """
     assert record.start is not None
-    first = record.start + pd.Timedelta(record.time[0] - 366 * DAY, "s")
-    hours = pd.date_range(first, periods=24 * int(record.duration / DAY + 2 * 366), freq="h")
-    saving = np.array([bool(stamp.dst()) for stamp in hours.tz_convert(zone).to_pydatetime()])
+    # Clocks change at full or half hours of UTC, whenever the record starts.
+    first = (record.start + pd.Timedelta(record.time[0] - 366 * DAY, "s")).tz_convert("UTC")
+    halves = pd.date_range(
+        first.floor("30min"), periods=48 * int(record.duration / DAY + 2 * 366), freq="30min"
+    )
+    saving = np.array([bool(stamp.dst()) for stamp in halves.tz_convert(zone).to_pydatetime()])
     there = saving if season == "summers" else ~saving
     changes = np.flatnonzero(np.diff(there.astype(int))) + 1
     if len(changes) and not there[changes[0]]:
         changes = changes[1:]
-    seconds = np.asarray((hours - record.start).total_seconds())
+    seconds = np.asarray((halves - record.start).total_seconds())
     return tuple(float(seconds[k]) for k in changes)
