@@ -231,7 +231,8 @@ class TestClockShift:
         found = clock_shift(daylight_saving(1), zones=("Europe/Berlin", MELBOURNE))
         assert found.p_value < 1e-4
         assert found.where == {
-            "channel": "hour", "rule": MELBOURNE, "season": "summers", "shift": 1.0, "time": 352.0
+            "channel": "hour", "rule": MELBOURNE, "season": "summers", "shift": 1.0, "time": 352.0,
+            "time_unit": "s", "stamp": "2023-04-01T16:00:00+00:00", "zone": "UTC",
         }  # fmt: skip
 
     @pytest.mark.parametrize("shift", [2.0, -2.0])
