@@ -278,6 +278,8 @@ def test_units_and_order_do_not_matter(detector):
             assert other.where[key] == pytest.approx(60.0 * value, rel=1e-6)
         elif key == "size":
             assert other.where[key] == pytest.approx(1e-3 * value, rel=1e-6)
+        elif key == "time_unit":
+            assert (value, other.where[key]) == ("s", "min")
         else:
             assert other.where[key] == value
 
