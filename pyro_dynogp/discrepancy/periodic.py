@@ -92,7 +92,7 @@ def periodic_disturbance(residuals: Residuals, *, seed: int = 0) -> Evidence:
         p_value=found.p_value,
         gain=found.gain,
         size=size,
-        where={"period": period},
+        where={"period": period, "output": r.output_name, "time_unit": r.time_unit},
         sentence=f"A disturbance of {r.output_name!r} with a period of {period:.4g} {r.time_unit}"
         f"{more}: {size_in_words(r, size)}.",
         curve=_folded(r, x, effect, period),

@@ -45,6 +45,9 @@ CALENDAR_PARTS = {
 # Samples by which the instant of a shifted clock is moved to refine it, first and then.
 FARTHEST = ((7, 14, 21, 28, 35), (1, 2, 3))
 
+# Shares of its resolution by which a period is moved to refine it, first and then.
+NEARER = ((-0.1, -0.05, 0.05, 0.1), (-0.03, 0.03))
+
 
 class Drift(Effect):
     """A level, or a gain, that changes slowly."""
@@ -96,13 +99,39 @@ class PeriodicDisturbance(Effect):
     test = staticmethod(periodic_disturbance)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
-        """A sinusoid of the period, and of periods within its resolution."""
+        """A sinusoid of the period, and of periods within its resolution.
+
+        Or of two and three times the period: process noise may have taken the fundamental, and the
+        residual has a harmonic only.
+        """
         period = number_of(evidence, "period")
         width = period**2 / record.duration
+        waves = [Sinusoid(period + share * width, 1) for share in (-0.2, -0.1, 0.0, 0.1, 0.2)]
+        waves += [Sinusoid(period, 3), *(Sinusoid(k * period, k) for k in (2, 3))]
+        return [with_channel(model, wave) for wave in waves]
+
+    def refine(self, model: Model, record: Record, times: int) -> Sequence[Model]:
+        """The period a little shorter and longer, in shares of its resolution."""
+        wave = model.channels[-1]
+        assert isinstance(wave, Sinusoid)
+        width = wave.period**2 / record.duration
         return [
-            with_channel(model, Sinusoid(period + share * width, 1))
-            for share in (-0.2, -0.1, 0.0, 0.1, 0.2)
-        ] + [with_channel(model, Sinusoid(period, 3))]
+            replace(
+                model,
+                channels=(*model.channels[:-1], replace(wave, period=wave.period + share * width)),
+            )
+            for share in NEARER[times]
+        ]
+
+    def sentence(self, evidence: Evidence, model: Model) -> str:
+        """The period as refits have it."""
+        wave = model.channels[-1]
+        assert isinstance(wave, Sinusoid)
+        several = f" and {wave.harmonics} harmonics" if wave.harmonics > 1 else ""
+        return (
+            f"A disturbance of {evidence.where['output']!r} with a period of "
+            f"{wave.period:.4g}{unit_of(evidence)}{several}."
+        )
 
 
 class CalendarEffect(Effect):
