@@ -193,13 +193,13 @@ def _judge(found: Found, kind: Kind, tried: Tried, base: Tried, number: int) -> 
     d = tried.densities - base.densities
     gain, error = float(d.sum()), block_standard_error(d)[0]
     reason = f"held-out elpd {gain:+.1f} +- {error:.1f} nats"
-    helps, capped = _counts(d), np.minimum(d, CAP)
-    if not helps and _counts(capped):
+    helps, capped = certain(d), np.minimum(d, CAP)
+    if not helps and certain(capped):
         helps = True
         reason += f"; {capped.sum():+.1f} with no sample counted for more than {CAP:.0f}"
     if len(tried.errors):  # what is one step ahead for the noise must not cost the structure
         loss = _loss(tried.errors, base.errors)
-        if harms := _counts(loss) and loss.mean() > HARM:
+        if harms := certain(loss) and loss.mean() > HARM:
             reason += (
                 f"; forecasts worse by {loss.sum():.1f} +- {block_standard_error(loss)[0]:.1f}"
             )
@@ -208,7 +208,7 @@ def _judge(found: Found, kind: Kind, tried: Tried, base: Tried, number: int) -> 
     return _Judged(found, kind, tried, attempt, helps)
 
 
-def _counts(gains: np.ndarray) -> bool:
+def certain(gains: np.ndarray) -> bool:
     """Whether gains (N,) of single samples are certainly more than nothing in all."""
     return bool(gains.sum() > max(NATS, ERRORS * block_standard_error(gains)[0]))
 

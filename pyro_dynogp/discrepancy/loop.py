@@ -101,10 +101,10 @@ def close_loop(
     left = False
     for number in range(1, max_rounds + 1):
         known = {one.effect.name for one, _ in accepted}
-        residuals, found, skipped = rounds.look(current, known)
+        residuals, found, notes = rounds.look(current, known)
         watch.stop("residual tests")
         if number == 1:
-            warnings += [*_faults(residuals, data.known), *skipped]
+            warnings += [*_faults(residuals, data.known), *notes]
         reported = _reported(found, level)
         left = rounds.structure(residuals, found)
         chosen = candidates_of(found, model, data.known, level, tries) if left else []

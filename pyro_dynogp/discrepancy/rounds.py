@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.discrepancy.blocks import Blocks, shared
-from pyro_dynogp.discrepancy.confirm import Confirmed, confirm
+from pyro_dynogp.discrepancy.confirm import Confirmed, certain, confirm
 from pyro_dynogp.discrepancy.effects import Effect
 from pyro_dynogp.discrepancy.evidence import Residuals
 from pyro_dynogp.discrepancy.extend import (
@@ -20,7 +21,7 @@ from pyro_dynogp.discrepancy.gate import structure_left
 from pyro_dynogp.discrepancy.refits import quick_fit
 from pyro_dynogp.discrepancy.residuals import residuals_of
 from pyro_dynogp.discrepancy.search import Found, look, merged
-from pyro_dynogp.discrepancy.trials import without
+from pyro_dynogp.discrepancy.trials import forecast_errors, held_out_density, without
 from pyro_dynogp.record import Record
 
 if TYPE_CHECKING:
@@ -81,7 +82,7 @@ class Rounds:
     def look(
         self, fit: Fit, known: Collection[str]
     ) -> tuple[list[Residuals], list[Found], list[str]]:
-        """Residuals, evidence of all effects but those that are known, what was not tested.
+        """Residuals, evidence of all effects but those that are known, what else there is to say.
 
         Process noise can take up what inputs do, and a simulation with it explains less than it
         could: what goes with inputs is looked for in the residuals of a fit without it, too.
@@ -91,7 +92,7 @@ class Rounds:
         options: dict[str, Any] = {
             "seed": self.seed, "workers": self.workers, "progress": self.progress,
         }  # fmt: skip
-        found, skipped = look(residuals, effects, **options)
+        found, notes = look(residuals, effects, **options)
         plain = without_process_noise(fit.model)
         if plain != fit.model:
             structural = [e for e in effects if e.family in OF_INPUTS and e.score == "forecast"]
@@ -99,7 +100,26 @@ class Rounds:
             again = quick_fit(plain, training, self.seed, fit)
             others = self.residuals(again, self.data.known, self.held_out)
             found = merged(found, look(others, structural, **options)[0])
-        return residuals, found, skipped
+            notes += self.hiding(fit, again)
+        return residuals, found, notes
+
+    def hiding(self, fit: Fit, plain: Fit) -> list[str]:
+        """In words, whether a model forecasts held-out data better without its process noise."""
+        both = [forecast_errors(one, self.data.known, self.held_out) for one in (fit, plain)]
+        densities = [
+            held_out_density(one, self.data.known, self.held_out, "forecast")
+            for one in (fit, plain)
+        ]
+        gain = densities[1] - densities[0]
+        if not certain(gain):
+            return []
+        before, after = (float(np.sqrt(np.nanmean(error**2))) for error, _ in both)
+        return [
+            "The model as given forecasts held-out data better without its process noise (elpd "
+            f"{gain.sum():+.1f} +- {block_standard_error(gain)[0]:.1f} nats, RMSE {before:.3g} -> "
+            f"{after:.3g}): such noise can hide what is missing. Fit it with process_noise=False, "
+            "and close the loop on that."
+        ]
 
     def confirm(self, chosen: Any, current: Fit, number: int) -> Confirmed:
         """Refit what is chosen in a round, and judge it."""

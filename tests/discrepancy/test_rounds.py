@@ -1,0 +1,45 @@
+"""What is said of process noise that hides what is missing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+import pyro_dynogp as dgp
+from pyro_dynogp.discrepancy import effects
+from pyro_dynogp.discrepancy.blocks import blocks_of
+from pyro_dynogp.discrepancy.extend import without_process_noise
+from pyro_dynogp.discrepancy.refits import quick_fit
+from pyro_dynogp.discrepancy.rounds import Rounds
+from pyro_dynogp.discrepancy.trials import without
+
+N = 480
+MODEL = dgp.LinearDynamicGP(1, pairs=1)
+
+
+def oscillator(late: int, noise: float, seed: int) -> dgp.Record:
+    """A lightly damped oscillator; its input acts some samples late, and noise acts with it."""
+    rng = np.random.default_rng(seed)
+    u = lfilter([0.6], [1.0, -0.4], rng.standard_normal(N + late))
+    pole = 0.96 * np.exp(0.5j)
+    a = [1.0, -2.0 * pole.real, abs(pole) ** 2]
+    x = lfilter([0.0, 0.3, 0.1], a, u[:N] + noise * rng.standard_normal(N))
+    y = x / x.std() + 0.02 * rng.standard_normal(N)
+    return dgp.Record(0.1 * np.arange(N), u[late:], y)
+
+
+@pytest.mark.parametrize(("late", "noise", "hides"), [(12, 0.0, True), (0, 0.5, False)])
+def test_process_noise_that_costs_forecasts_is_pointed_out(late, noise, hides):
+    record = oscillator(late, noise, seed=1)
+    fit = dgp.fit(MODEL, record[:240], restarts=2, workers=1, progress=False)
+    data = blocks_of(fit, record, None)
+    training = without(data.known, data.held_out)
+    rounds = Rounds(data, [], 0, 0.05, 8, (effects.LevelShift(),), 1, False)
+    plain = quick_fit(without_process_noise(MODEL), training, 0, fit)
+    said = rounds.hiding(quick_fit(MODEL, training, 0, fit), plain)
+    assert bool(said) == hides, said
+    if hides:
+        assert "better without its process noise (elpd +" in said[0]
+        _, _, notes = rounds.look(quick_fit(MODEL, training, 0, fit), set())
+        assert any("process_noise=False" in one for one in notes)
