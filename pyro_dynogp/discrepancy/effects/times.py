@@ -107,7 +107,9 @@ class PeriodicDisturbance(Effect):
         period = number_of(evidence, "period")
         width = period**2 / record.duration
         waves = [Sinusoid(period + share * width, 1) for share in (-0.2, -0.1, 0.0, 0.1, 0.2)]
-        waves += [Sinusoid(period, 3), *(Sinusoid(k * period, k) for k in (2, 3))]
+        waves.append(Sinusoid(period, 3))
+        # What does not come twice in a record is a drift.
+        waves += [Sinusoid(k * period, k) for k in (2, 3) if 2 * k * period <= record.duration]
         return [with_channel(model, wave) for wave in waves]
 
     def refine(self, model: Model, record: Record, times: int) -> Sequence[Model]:
