@@ -215,13 +215,12 @@ class ClockShift(Effect):
 
     def sentence(self, evidence: Evidence, model: Model) -> str:
         """The shift and its instant as refits have them."""
-        last = model.channels[-1]
-        assert isinstance(last, ShiftedClock)
+        found = self._found(model)
+        last = found[-1]
         if len(last.times) > 1:
             return evidence.sentence
         (at,), where = last.times, evidence.where
-        same = [c for c in model.channels if isinstance(c, ShiftedClock) and c.times == last.times]
-        names = " and ".join(repr(c.channel) for c in same)
+        names = " and ".join(repr(c.channel) for c in found)
         if "stamp" in where:
             stamp = pd.Timestamp(str(where["stamp"])).tz_convert(str(where["zone"]))
             stamp += pd.Timedelta(at - number_of(evidence, "time"), "s")
@@ -235,8 +234,8 @@ class ClockShift(Effect):
 
     def refine(self, model: Model, record: Record, times: int) -> Sequence[Model]:
         """Other instants and shifts nearby, some samples away; what a rule says stays."""
-        last = model.channels[-1]
-        assert isinstance(last, ShiftedClock)
+        found = self._found(model)
+        last = found[-1]
         if len(last.times) > 1:
             return []
         step, coarse = record.sampling_time, FARTHEST[times]
@@ -250,17 +249,23 @@ class ClockShift(Effect):
             if record.time[0] < time < record.time[-1] and shift
             if (time, shift) != (last.times[0], last.shift)
         ]
-        same = [c for c in model.channels if isinstance(c, ShiftedClock) and c.times == last.times]
         return [
             replace(
                 model,
                 channels=tuple(
-                    replace(c, shift=shift, times=(time,)) if c in same else c
+                    replace(c, shift=shift, times=(time,)) if c in found else c
                     for c in model.channels
                 ),
             )
             for time, shift in inside
         ]
+
+    @staticmethod
+    def _found(model: Model) -> list[ShiftedClock]:
+        """Clocks that were corrected last, together."""
+        last = model.channels[-1]
+        assert isinstance(last, ShiftedClock)
+        return [c for c in model.channels if isinstance(c, ShiftedClock) and c.times == last.times]
 
 
 def seasons(record: Record, zone: str, season: str) -> tuple[float, ...]:
