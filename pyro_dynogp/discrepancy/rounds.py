@@ -100,25 +100,28 @@ class Rounds:
             again = quick_fit(plain, training, self.seed, fit)
             others = self.residuals(again, self.data.known, self.held_out)
             found = merged(found, look(others, structural, **options)[0])
-            notes += self.hiding(fit, again)
+            if not known:  # of the model as given
+                notes += self.hiding(fit, again)
         return residuals, found, notes
 
     def hiding(self, fit: Fit, plain: Fit) -> list[str]:
         """In words, whether a model forecasts held-out data better without its process noise."""
-        both = [forecast_errors(one, self.data.known, self.held_out) for one in (fit, plain)]
-        densities = [
-            held_out_density(one, self.data.known, self.held_out, "forecast")
-            for one in (fit, plain)
-        ]
-        gain = densities[1] - densities[0]
+        record, held_out = self.data.known, self.held_out
+        one, other = (held_out_density(f, record, held_out, "forecast") for f in (fit, plain))
+        gain = other - one
         if not certain(gain):
             return []
-        before, after = (float(np.sqrt(np.nanmean(error**2))) for error, _ in both)
+        errors = (forecast_errors(f, record, held_out)[0] for f in (fit, plain))
+        before, after = (np.sqrt(np.nanmean(error**2, axis=0)) for error in errors)
+        rmse = "; ".join(
+            f"{name} {a:.3g} -> {b:.3g}"
+            for name, a, b in zip(record.output_names, before, after, strict=True)
+        )
         return [
             "The model as given forecasts held-out data better without its process noise (elpd "
-            f"{gain.sum():+.1f} +- {block_standard_error(gain)[0]:.1f} nats, RMSE {before:.3g} -> "
-            f"{after:.3g}): such noise can hide what is missing. Fit it with process_noise=False, "
-            "and close the loop on that."
+            f"{gain.sum():+.1f} +- {block_standard_error(gain)[0]:.1f} nats, RMSE of {rmse}): such "
+            "noise can hide what is missing. Fit it with process_noise=False, and close the loop "
+            "on that."
         ]
 
     def confirm(self, chosen: Any, current: Fit, number: int) -> Confirmed:
