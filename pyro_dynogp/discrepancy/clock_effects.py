@@ -135,7 +135,6 @@ def clock_shift(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 
     where |= {"shift": shift, "time": float(r.time[at]), "time_unit": r.time_unit}
     if r.stamps is not None:
         where |= {"stamp": r.stamps[at].isoformat(), "zone": str(r.stamps.tz)}
-    late = "late" if shift > 0 else "early"
     size = float(np.std(effect))
     return Evidence(
         effect="clock shift",
@@ -144,10 +143,15 @@ def clock_shift(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 
         gain=float(found.gains[best]),
         size=size,
         where=where,
-        sentence=f"The clock of {' and '.join(map(repr, name))} is {abs(shift):.4g} {r.time_unit} "
-        f"{late} {when}: about {size:.2g} {r.output_unit} (rms) of {r.output_name!r}.",
+        sentence=f"{off(' and '.join(map(repr, name)), shift, f' {r.time_unit}')} {when}: "
+        f"about {size:.2g} {r.output_unit} (rms) of {r.output_name!r}.",
         curve=over_time(r, effect - effect.mean()),
     )
+
+
+def off(names: str, shift: float, unit: str) -> str:
+    """By how much a clock is off, in words; the unit with a blank before it."""
+    return f"The clock of {names} is {abs(shift):.4g}{unit} {'late' if shift > 0 else 'early'}"
 
 
 def _rules(r: Residuals, zones: Sequence[str]) -> tuple[list[tuple[str, str]], np.ndarray]:

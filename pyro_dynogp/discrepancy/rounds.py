@@ -21,7 +21,7 @@ from pyro_dynogp.discrepancy.gate import structure_left
 from pyro_dynogp.discrepancy.refits import quick_fit
 from pyro_dynogp.discrepancy.residuals import residuals_of
 from pyro_dynogp.discrepancy.search import Found, look, merged
-from pyro_dynogp.discrepancy.trials import forecast_errors, held_out_density, without
+from pyro_dynogp.discrepancy.trials import forecast_density, forecast_errors, without
 from pyro_dynogp.record import Record
 
 if TYPE_CHECKING:
@@ -107,11 +107,14 @@ class Rounds:
     def hiding(self, fit: Fit, plain: Fit) -> list[str]:
         """In words, whether a model forecasts held-out data better without its process noise."""
         record, held_out = self.data.known, self.held_out
-        one, other = (held_out_density(f, record, held_out, "forecast") for f in (fit, plain))
-        gain = other - one
+        errors, densities = [], []
+        for one in (fit, plain):
+            error, sd = (x[held_out] for x in forecast_errors(one, record, held_out))
+            errors.append(error)
+            densities.append(forecast_density(error, sd))
+        gain = (densities[1] - densities[0])[~record.missing[held_out]]
         if not certain(gain):
             return []
-        errors = (forecast_errors(f, record, held_out)[0] for f in (fit, plain))
         before, after = (np.sqrt(np.nanmean(error**2, axis=0)) for error in errors)
         rmse = "; ".join(
             f"{name} {a:.3g} -> {b:.3g}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 
 from pyro_dynogp.discrepancy.evidence import Curve, Residuals
 
@@ -32,8 +33,13 @@ def size_in_words(r: Residuals, size: float) -> str:
     return f"about {size:.2g} {r.output_unit} (rms)".replace("  ", " ")
 
 
+def in_words(stamp: pd.Timestamp) -> str:
+    """A time stamp to the second, with its zone."""
+    return f"{stamp:%Y-%m-%d %H:%M:%S %Z}"
+
+
 def instant(r: Residuals, at: int) -> str:
     """When a sample was taken, in words."""
     if r.stamps is not None:
-        return f"{r.stamps[at]:%Y-%m-%d %H:%M:%S %Z}"
+        return in_words(r.stamps[at])
     return f"time {r.time[at]:.5g} {r.time_unit}"

@@ -166,14 +166,23 @@ def held_out_density(fit: Fit, record: Record, fold: np.ndarray, score: Score) -
     prepared = fit.model.check(record)[0]
     there = ~prepared.missing
     if score == "one step":
-        density = one_step_density(fit, prepared)
+        density = one_step_density(fit, prepared)[fold]
     else:
         error, sd = forecast_errors(fit, prepared, fold)
-        z = error / sd
-        spread = np.sqrt(np.nanmean(z[fold] ** 2, axis=0))
-        density = -0.5 * ((z / spread) ** 2 + np.log(2.0 * np.pi)) - np.log(spread * sd)
-    scored: np.ndarray = density[fold][there[fold]]
+        density = forecast_density(error[fold], sd[fold])
+    scored: np.ndarray = density[there[fold]]
     return scored
+
+
+def forecast_density(error: np.ndarray, sd: np.ndarray) -> np.ndarray:
+    """Log-densities (n, n_y) of errors under the sds times the factor that suits them best [nats].
+
+    NaN where the errors are.
+    """
+    z = error / sd
+    spread = np.sqrt(np.nanmean(z**2, axis=0))
+    density: np.ndarray = -0.5 * ((z / spread) ** 2 + np.log(2.0 * np.pi)) - np.log(spread * sd)
+    return density
 
 
 def forecast_errors(fit: Fit, record: Record, fold: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -194,3 +194,9 @@ def _cholesky(K: Tensor, level: Tensor, what: str) -> Tensor:
             "the inputs or points far apart are the usual causes."
         )
     return root
+
+
+def even_grid(low: Tensor, high: Tensor, count: int) -> Tensor:
+    """Even grid (*b, count) from low (*b) to high (*b)."""
+    share = torch.linspace(0.0, 1.0, count, dtype=torch.float64, device=low.device)
+    return low.unsqueeze(-1) + (high - low).unsqueeze(-1) * share

@@ -61,7 +61,7 @@ def function_of_distance(form: str, lengthscale: Tensor, x1: Tensor, x2: Tensor 
 
 
 def _difference(x1: Tensor, x2: Tensor, channel: int) -> Tensor:
-    """X - x' (*b, n, m) in one channel.
+    """Difference x - x' (*b, n, m) in one channel.
 
     Differences, not |x|^2 - 2 x'y + |y|^2: near points would lose their distance to rounding.
     """

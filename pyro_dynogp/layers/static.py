@@ -19,7 +19,7 @@ from torch import Tensor
 
 from pyro_dynogp._errors import invalid
 from pyro_dynogp._tensors import as_tensor
-from pyro_dynogp.layers.functions import JITTER, StaticFunction
+from pyro_dynogp.layers.functions import JITTER, StaticFunction, even_grid
 from pyro_dynogp.layers.kernels import sample_kernel
 
 MeanName = Literal["constant", "linear"]
@@ -28,12 +28,6 @@ MeanName = Literal["constant", "linear"]
 REACH = 3.0
 # Share of the range of x that support points reach beyond it on either side.
 MARGIN = 0.02
-
-
-def _even_grid(low: Tensor, high: Tensor, count: int) -> Tensor:
-    """(*b, count) from low to high (*b)."""
-    share = torch.linspace(0.0, 1.0, count, dtype=torch.float64, device=low.device)
-    return low.unsqueeze(-1) + (high - low).unsqueeze(-1) * share
 
 
 def starting_locations(inducing: int, channels: int) -> Tensor:
@@ -236,4 +230,4 @@ def _support(support: Any, x: Tensor) -> Tensor:
         return x[..., index.round().long(), :]
     low, high = x.squeeze(-1).amin(-1), x.squeeze(-1).amax(-1)
     margin = MARGIN * (high - low)
-    return _even_grid(low - margin, high + margin, support).unsqueeze(-1)
+    return even_grid(low - margin, high + margin, support).unsqueeze(-1)

@@ -174,7 +174,9 @@ class _Assembler:
                 select[i, o] = 1.0
         self.gains.append(self.expand(gain @ select, 3))
         self.modes.append(modes)
-        self.covariances.append(layer.prior_state(self.process_noise).covariance)  # type: ignore
+        covariance = layer.prior_state(self.process_noise).covariance
+        assert covariance is not None  # a prior always has one
+        self.covariances.append(covariance)
         rows = self.state_rows(modes)
         if seen.rows is not None:
             rows = rows + modes.D @ seen.rows

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pyro_dynogp._errors import invalid
 from pyro_dynogp._tensors import broadcast
-from pyro_dynogp.layers.functions import StaticFunction
+from pyro_dynogp.layers.functions import StaticFunction, even_grid
 from pyro_dynogp.moments.functions import KERNELS
 from pyro_dynogp.moments.problem import TABLE
 
@@ -102,9 +102,7 @@ def _function(block: Block, M: int, widest: int) -> tuple[int, dict[str, Tensor]
         return KERNELS["rbf"], values
     if d == 1:
         low, high = table_range(function)
-        share = torch.linspace(0.0, 1.0, GRID, dtype=torch.float64)
-        grid = low.unsqueeze(-1) + (high - low).unsqueeze(-1) * share
-        mean, variance = function.moments(grid.unsqueeze(-1))
+        mean, variance = function.moments(even_grid(low, high, GRID).unsqueeze(-1))
         values["table_mean"] = mean.mT
         if block.with_variance:
             values["table_variance"] = variance.mT

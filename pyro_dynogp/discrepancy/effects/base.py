@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
-from pyro_dynogp.channels.base import signal_of
+from pyro_dynogp.channels.base import Channel, signal_of
 from pyro_dynogp.discrepancy.evidence import Evidence, Residuals
 from pyro_dynogp.discrepancy.extend import Model
 from pyro_dynogp.discrepancy.trials import Compared, Score
 from pyro_dynogp.record import Record
 
+Kind = TypeVar("Kind", bound=Channel)
 # Share of its estimate by which a limit or a width may be off, tried by refits, and then finer.
 AROUND = (0.75, 1.0, 1.3)
 FINER = ((0.88, 1.13), (0.95, 1.05))
@@ -85,6 +86,20 @@ def centre_of(record: Record, name: str) -> float:
 
 def finer(model: Model, number: str, times: int) -> list[Model]:
     """The model with a number of its last channel a little smaller and larger."""
-    *rest, last = model.channels
+    last = model.channels[-1]
     values = [share * getattr(last, number) for share in FINER[times]]
-    return [replace(model, channels=(*rest, replace(last, **{number: v}))) for v in values]
+    return [changed(model, [last], **{number: value}) for value in values]
+
+
+def set_last(model: Model, kind: type[Kind], number: str) -> list[Kind]:
+    """Channels of a kind that were added last, together: those that share a number."""
+    last = model.channels[-1]
+    assert isinstance(last, kind)
+    same = getattr(last, number)
+    return [c for c in model.channels if isinstance(c, kind) and getattr(c, number) == same]
+
+
+def changed(model: Model, channels: Sequence[Channel], **values: Any) -> Model:
+    """The model with other values of some of its channels."""
+    new = tuple(replace(c, **values) if c in channels else c for c in model.channels)
+    return replace(model, channels=new)

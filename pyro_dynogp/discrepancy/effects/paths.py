@@ -14,8 +14,10 @@ from pyro_dynogp.discrepancy.effects.base import (
     FINER,
     Effect,
     centre_of,
+    changed,
     listed,
     number_of,
+    set_last,
     unit_of,
 )
 from pyro_dynogp.discrepancy.evidence import Evidence, Residuals
@@ -94,34 +96,23 @@ class DeadTime(Effect):
 
     def sentence(self, evidence: Evidence, model: Model) -> str:
         """The channels and their delay as refits have them."""
-        found = self._found(model)
+        found = set_last(model, Delayed, "delay")
         names = " and ".join(repr(one.channel) for one in found)
         start = f"Channel {names} acts" if len(found) == 1 else f"Channels {names} act"
         return f"{start} with a dead time of {found[0].delay:.3g}{unit_of(evidence)}."
 
     def refine(self, model: Model, record: Record, times: int) -> Sequence[Model]:
         """The delay a little shorter and longer, a sample or two at least."""
-        found = self._found(model)
+        found = set_last(model, Delayed, "delay")
         delay, step = found[0].delay, record.sampling_time
         near = {share * delay for share in FINER[times]}
         if record.is_regular:
             near |= {delay + k * step for k in (-2, -1, 1, 2)}
         return [
-            replace(
-                model,
-                channels=tuple(
-                    replace(one, delay=later) if one in found else one for one in model.channels
-                ),
-            )
+            changed(model, found, delay=later)
             for later in _resolved(near, record)
             if later != delay
         ]
-
-    def _found(self, model: Model) -> list[Delayed]:
-        """Delays that were set last, together."""
-        last = model.channels[-1]
-        assert isinstance(last, Delayed)
-        return [c for c in model.channels if isinstance(c, Delayed) and c.delay == last.delay]
 
 
 def _resolved(delays: Iterable[float], record: Record) -> list[float]:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import ClassVar
 
 from pyro_dynogp.channels import DeadZone, Play
-from pyro_dynogp.discrepancy.effects.base import AROUND, FINER, Effect, finer, number_of
+from pyro_dynogp.discrepancy.effects.base import AROUND, FINER, Effect, changed, finer, number_of
 from pyro_dynogp.discrepancy.evidence import Evidence
 from pyro_dynogp.discrepancy.extend import (
     Model,
@@ -89,12 +88,11 @@ class DeadZoneOfInput(Effect):
         last = model.channels[-1]
         assert isinstance(last, DeadZone)
         width = last.high - last.low
-        moved = [
-            replace(last, **{limit: getattr(last, limit) + (share - 1.0) * width})
+        return [
+            changed(model, [last], **{limit: getattr(last, limit) + (share - 1.0) * width})
             for share in FINER[times]
             for limit in ("low", "high")
         ]
-        return [replace(model, channels=(*model.channels[:-1], one)) for one in moved]
 
 
 class Hysteresis(Effect):

@@ -11,12 +11,14 @@ import pandas as pd
 from pyro_dynogp.channels import Calendar, ShiftedClock, Sinusoid, Step, Trend, TrendOfGain
 from pyro_dynogp.channels.clock import DAY
 from pyro_dynogp.discrepancy.calendar_effects import calendar
-from pyro_dynogp.discrepancy.clock_effects import clock_shift
+from pyro_dynogp.discrepancy.clock_effects import clock_shift, off
 from pyro_dynogp.discrepancy.effects.base import (
     Effect,
     centre_of,
+    changed,
     listed,
     number_of,
+    set_last,
     unit_of,
 )
 from pyro_dynogp.discrepancy.evidence import Evidence, Residuals
@@ -29,6 +31,7 @@ from pyro_dynogp.discrepancy.extend import (
 )
 from pyro_dynogp.discrepancy.periodic import periodic_disturbance
 from pyro_dynogp.discrepancy.time_effects import drift, level_shift
+from pyro_dynogp.discrepancy.time_pictures import in_words
 from pyro_dynogp.record import Record
 
 # One zone for each common rule of daylight saving: clocks tell zones apart by their transitions.
@@ -118,11 +121,7 @@ class PeriodicDisturbance(Effect):
         assert isinstance(wave, Sinusoid)
         width = wave.period**2 / record.duration
         return [
-            replace(
-                model,
-                channels=(*model.channels[:-1], replace(wave, period=wave.period + share * width)),
-            )
-            for share in NEARER[times]
+            changed(model, [wave], period=wave.period + share * width) for share in NEARER[times]
         ]
 
     def sentence(self, evidence: Evidence, model: Model) -> str:
@@ -215,7 +214,7 @@ class ClockShift(Effect):
 
     def sentence(self, evidence: Evidence, model: Model) -> str:
         """The shift and its instant as refits have them."""
-        found = self._found(model)
+        found = set_last(model, ShiftedClock, "times")
         last = found[-1]
         if len(last.times) > 1:
             return evidence.sentence
@@ -224,17 +223,14 @@ class ClockShift(Effect):
         if "stamp" in where:
             stamp = pd.Timestamp(str(where["stamp"])).tz_convert(str(where["zone"]))
             stamp += pd.Timedelta(at - number_of(evidence, "time"), "s")
-            when = f"{stamp:%Y-%m-%d %H:%M:%S %Z}"
+            when = in_words(stamp)
         else:
             when = f"time {at:.5g}{unit_of(evidence)}"
-        late = "late" if last.shift > 0 else "early"
-        return (
-            f"The clock of {names} is {abs(last.shift):.4g}{unit_of(evidence)} {late} from {when}."
-        )
+        return f"{off(names, last.shift, unit_of(evidence))} from {when}."
 
     def refine(self, model: Model, record: Record, times: int) -> Sequence[Model]:
         """Other instants and shifts nearby, some samples away; what a rule says stays."""
-        found = self._found(model)
+        found = set_last(model, ShiftedClock, "times")
         last = found[-1]
         if len(last.times) > 1:
             return []
@@ -249,23 +245,7 @@ class ClockShift(Effect):
             if record.time[0] < time < record.time[-1] and shift
             if (time, shift) != (last.times[0], last.shift)
         ]
-        return [
-            replace(
-                model,
-                channels=tuple(
-                    replace(c, shift=shift, times=(time,)) if c in found else c
-                    for c in model.channels
-                ),
-            )
-            for time, shift in inside
-        ]
-
-    @staticmethod
-    def _found(model: Model) -> list[ShiftedClock]:
-        """Clocks that were corrected last, together."""
-        last = model.channels[-1]
-        assert isinstance(last, ShiftedClock)
-        return [c for c in model.channels if isinstance(c, ShiftedClock) and c.times == last.times]
+        return [changed(model, found, shift=shift, times=(time,)) for time, shift in inside]
 
 
 def seasons(record: Record, zone: str, season: str) -> tuple[float, ...]:
