@@ -12,7 +12,8 @@ from torch import Tensor
 
 from pyro_dynogp._compiled_cache import OPTIONS
 from pyro_dynogp._errors import invalid
-from pyro_dynogp.lti import recursions
+from pyro_dynogp.lti.arithmetic import rotate_rows
+from pyro_dynogp.lti.factorisation import factor_row
 from pyro_dynogp.lti.primitives import array, flatten_batch
 from pyro_dynogp.lti.semiseparable import SemiseparableCovariance
 
@@ -58,13 +59,11 @@ def _k_step(re, im, step, lam, time, h, g, k0, v, S0, Y, horizon):
             _emit(F[:, 0], S, lam[b], h[b], k0[b], age, j, mean[b], variance[b])
         for i in range(n):
             if step[i] >= 0:
-                recursions._rotate_rows(F, re[b, step[i]], im[b, step[i]])
+                rotate_rows(F, re[b, step[i]], im[b, step[i]])
             for a in range(n_y):
                 row = i * n_y + a
                 k = step[i] if a == 0 else -1
-                p = recursions._factor_row(
-                    S, re[b], im[b], k, h[b, a], g[b, a], k0[b, a], v[b, row], s, e
-                )
+                p = factor_row(S, re[b], im[b], k, h[b, a], g[b, a], k0[b, a], v[b, row], s, e)
                 z = Y[b, row]
                 for m in range(J):
                     z -= h[b, a, m] * F[m, 0]

@@ -15,12 +15,12 @@ from torch import Tensor
 from torch.overrides import handle_torch_function, has_torch_function
 
 from pyro_dynogp._tensors import broadcast
-from pyro_dynogp.lti import recursions
+from pyro_dynogp.lti import factorisation, information, products
 
 
 @dataclass(frozen=True)
 class Generators:
-    """What defines the rows of a semiseparable covariance (see `recursions`).
+    """What defines the rows of a semiseparable covariance (see `factorisation`).
 
     Attributes:
         re, im: (*b, m, P) propagators exp(lambda d) of the m distinct steps.
@@ -59,13 +59,14 @@ class _Factor(_Recursion):
         re, im, h, g, k0, v, S0 = (array(a) for a in args)
         ctx.save_for_backward(*args)
         ctx.index = (step, out)
-        return _Recursion.tensors(args[0], *recursions.factor(re, im, step, out, h, g, k0, v, S0))
+        found = factorisation.factor(re, im, step, out, h, g, k0, v, S0)
+        return _Recursion.tensors(args[0], *found)
 
     @staticmethod
     def backward(ctx: Any, *bars: Tensor) -> Any:
         re, im, h, g, k0, v, S0 = (array(a) for a in ctx.saved_tensors)
         step, out = ctx.index
-        grads = recursions.factor_adjoint(
+        grads = factorisation.factor_adjoint(
             re, im, step, out, h, g, k0, v, S0, *(array(b) for b in bars)
         )
         return (None, None, *_Recursion.tensors(bars[0], *grads))
@@ -77,7 +78,7 @@ class _Lower(_Recursion):
     @staticmethod
     def forward(ctx: Any, step: Any, out: Any, solve: bool, transpose: bool, *args: Tensor) -> Any:
         arrays = [array(a) for a in args]  # re im h w X
-        kernel = recursions.upper if transpose else recursions.lower
+        kernel = products.upper if transpose else products.lower
         re, im, h, w, X = arrays
         (Z,) = _Recursion.tensors(args[0], kernel(re, im, step, out, h, w, X, solve))
         ctx.save_for_backward(*args, Z)
@@ -88,13 +89,13 @@ class _Lower(_Recursion):
     def backward(ctx: Any, Z_bar: Tensor) -> Any:
         re, im, h, w, X, Z = (array(a) for a in ctx.saved_tensors)
         step, out, solve, transpose = ctx.index
-        kernel = recursions.lower if transpose else recursions.upper
+        kernel = products.lower if transpose else products.upper
         X_bar = kernel(re, im, step, out, h, w, array(Z_bar), solve)
         # <Z_bar, dM X> for a product; for a solution -<X_bar, dM Z>.
         left, right = (-X_bar, Z) if solve else (array(Z_bar), X)
         if transpose:
             left, right = right, left
-        grads = recursions.lower_gradient(re, im, step, out, h, w, right, left)
+        grads = products.lower_gradient(re, im, step, out, h, w, right, left)
         return (None, None, None, None, *_Recursion.tensors(Z_bar, *grads, X_bar))
 
 
@@ -104,14 +105,14 @@ class _LaterInformation(_Recursion):
         re, im, h, e, d = (array(a) for a in args)
         ctx.save_for_backward(*args)
         ctx.index = (step, out)
-        kappa = recursions.later_information(re, im, step, out, h, e, d)
+        kappa = information.later_information(re, im, step, out, h, e, d)
         return _Recursion.tensors(args[0], kappa)[0]
 
     @staticmethod
     def backward(ctx: Any, kappa_bar: Tensor) -> Any:
         re, im, h, e, d = (array(a) for a in ctx.saved_tensors)
         step, out = ctx.index
-        grads = recursions.later_information_adjoint(re, im, step, out, h, e, d, array(kappa_bar))
+        grads = information.later_information_adjoint(re, im, step, out, h, e, d, array(kappa_bar))
         return (None, None, *_Recursion.tensors(kappa_bar, *grads))
 
 
@@ -162,7 +163,7 @@ def triangular(
 
 
 def later_information(rows: Generators, e: Tensor, d: Tensor) -> Tensor:
-    """Information of later rows on each row, e' Lambda e (*b, N); see `recursions`."""
+    """Information of later rows on each row, e' Lambda e (*b, N); see `information`."""
     args, batch = flatten_batch([rows.re, rows.im, rows.h, e, d], [2, 2, 2, 2, 1])
     kappa = run(_LaterInformation, (rows.step, rows.out), *args)
     return kappa.reshape(batch + kappa.shape[1:])

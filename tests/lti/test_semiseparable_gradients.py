@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from pyro_dynogp.lti import recursions
+from pyro_dynogp.lti.arithmetic import SEGMENT
 from pyro_dynogp.lti.dense import DenseCovariance
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.semiseparable import SemiseparableCovariance
@@ -74,7 +74,7 @@ def test_numerical_derivatives(name):
                                                          (2, "independent", False)])  # fmt: skip
 def test_beyond_a_segment_against_the_dense_twin(name, outputs, noise, known):
     n = 150
-    assert n * (outputs or 1) > 2 * recursions._SEGMENT  # adjoints restart from checkpoints
+    assert n * (outputs or 1) > 2 * SEGMENT  # adjoints restart from checkpoints
     system = random_system(1, outputs=outputs, noise=noise)
     t = oracles.irregular_times(n, 1, scale=0.1)
     leaf = leaves(system, n)
