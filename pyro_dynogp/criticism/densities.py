@@ -26,7 +26,7 @@ from pyro_dynogp.distributions.trajectory import apply, split_missing
 from pyro_dynogp.lti.filtering import predict_k_steps
 from pyro_dynogp.models.assembly import assemble
 from pyro_dynogp.models.collapsed import ObservedCascade
-from pyro_dynogp.moments import recursion, smoothing
+from pyro_dynogp.moments import filtering, smoothing
 from pyro_dynogp.moments.problem import each
 
 Kind = Literal["missing sample", "forecast"]
@@ -101,7 +101,7 @@ def _cascade(observed: ObservedCascade, y: Tensor, kind: Kind, horizon: int) -> 
     def density(b: int) -> np.ndarray:
         values = elements[b]
         if kind == "missing sample":
-            _, means, covariances, _, _ = recursion.run(layout, values)
+            _, means, covariances, _, _ = filtering.run(layout, values)
             found = smoothing.leave_one_out(layout, values, means, covariances)
         elif horizon == 1:
             found = smoothing.innovate(layout, values)

@@ -22,7 +22,7 @@ from pyro_dynogp.models.layers import INPUTS, Dynamic, Static, Wire
 from pyro_dynogp.models.linear import LinearDynamicGP
 from pyro_dynogp.models.priors import TimeScale
 from pyro_dynogp.models.systems import DynamicSystem, scaled_inputs, see
-from pyro_dynogp.moments import recursion, smoothing
+from pyro_dynogp.moments import filtering, smoothing
 from pyro_dynogp.parallel import child_seeds
 from pyro_dynogp.record import Record
 from pyro_dynogp.scaling import Scaling
@@ -203,7 +203,7 @@ def _linear_state(
         assembly = assemble(system, time_grid(record.time), scaled_inputs(scaling, record))
         problem = assembly.with_outputs(_scaled_outputs(scaling, record))
         elements, _ = problem.elements()
-        _, means, covariances, _, _ = recursion.run(problem.layout, elements[0])
+        _, means, covariances, _, _ = filtering.run(problem.layout, elements[0])
         rows = np.zeros((0, problem.G.shape[-1]))
         first = smoothing.smooth(problem.layout, elements[0], rows, means, covariances)[0][0]
         dynamic = system.layers[0]

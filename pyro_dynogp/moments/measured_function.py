@@ -15,7 +15,7 @@ them f is its regression line, with what a line leaves as noise, all by Gauss-He
 three nodes, which are the component's own and the second neighbours. That is exact for a linear f,
 and good for others however small R is: no node has to meet the peak of the likelihood.
 
-The noise is a mixture of Gaussians, as in `recursion`. v is the function's own variance.
+The noise is a mixture of Gaussians, as in `noise`. v is the function's own variance.
 """
 
 from __future__ import annotations

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from pyro_dynogp.lti.primitives import array, flatten_batch
 from pyro_dynogp.lti.primitives import run as run_recursion
-from pyro_dynogp.moments import recursion
-from pyro_dynogp.moments.blocks import Layout, Values
+from pyro_dynogp.moments import filtering, reverse
 from pyro_dynogp.moments.functions import TABLE, gauss_hermite
+from pyro_dynogp.moments.layout import Layout, Values, zero_bars
 
 # Dimensions of each value right of the batch.
 _EVENTS = {
@@ -156,7 +156,7 @@ class _Filter(torch.autograd.Function):
     def forward(ctx: Any, layout: Layout, *args: Tensor) -> Tensor:
         arrays = [array(x) for x in args]
         elements = [Values(*(a[b] for a in arrays)) for b in range(arrays[0].shape[0])]
-        results = each(lambda b: recursion.run(layout, elements[b]), len(elements))
+        results = each(lambda b: filtering.run(layout, elements[b]), len(elements))
         ctx.layout = layout
         ctx.elements = elements
         ctx.starts = [(r[1], r[2]) for r in results]
@@ -165,9 +165,9 @@ class _Filter(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *bars: Tensor) -> Any:
         def gradient(b: int) -> Values:
-            out = recursion.zero_bars(ctx.elements[b])
+            out = zero_bars(ctx.elements[b])
             means, covariances = ctx.starts[b]
-            return recursion.run_adjoint(ctx.layout, ctx.elements[b], out, means, covariances)
+            return reverse.run_adjoint(ctx.layout, ctx.elements[b], out, means, covariances)
 
         scale = array(bars[0])
         gradients = each(gradient, len(ctx.elements))

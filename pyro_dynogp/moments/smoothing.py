@@ -14,20 +14,12 @@ import numpy as np
 from numba import njit
 
 from pyro_dynogp._compiled_cache import BORROWING, OPTIONS
-from pyro_dynogp.moments.blocks import FLOOR, append, workspace
+from pyro_dynogp.moments.filtering import SEGMENT, enter, inner, measure, output_terms, seen
+from pyro_dynogp.moments.layout import FLOOR, workspace
 from pyro_dynogp.moments.measured_function import function_moments, function_terms
-from pyro_dynogp.moments.recursion import (
-    SEGMENT,
-    covary,
-    dot,
-    enter,
-    inner,
-    measure,
-    noise_terms,
-    output_terms,
-    seen,
-    update,
-)
+from pyro_dynogp.moments.noise import noise_terms
+from pyro_dynogp.moments.state import covary, dot, update
+from pyro_dynogp.moments.static_layer import append
 
 
 @njit(**BORROWING)
@@ -193,7 +185,7 @@ def _before_layer(i, layout, values, bar, L, work, row):
 def smooth(layout, values, rows, means, covariances):
     """Smoothed mean (n, A) of [x; f] and variance (n, r) of the rows (r, A) of it.
 
-    means, covariances: what `recursion.run` kept at the segments.
+    means, covariances: what `filtering.run` kept at the segments.
     """
     cavity = np.empty((3, 0, values.y.shape[1]))
     return _backwards(layout, values, rows, means, covariances, cavity)

@@ -15,7 +15,7 @@ from pyro_dynogp._tensors import as_tensor
 from pyro_dynogp.lti.grid import TimeGrid, time_grid
 from pyro_dynogp.models.assembly import Assembly, assemble
 from pyro_dynogp.models.systems import CascadeSystem, DynamicSystem, scaled_inputs
-from pyro_dynogp.moments import recursion, smoothing
+from pyro_dynogp.moments import filtering, smoothing
 from pyro_dynogp.moments.problem import FilterProblem, each
 from pyro_dynogp.parallel import seeded
 from pyro_dynogp.prediction.beginning import beginning, cascade_of
@@ -81,7 +81,7 @@ def filtered_state(assembly: Assembly, y: Tensor) -> JointState:
     problem = assembly.with_outputs(y)
     elements, batch = problem.elements()
     N = problem.m0.shape[-1]
-    ends = each(lambda b: recursion.run(problem.layout, elements[b]), len(elements))
+    ends = each(lambda b: filtering.run(problem.layout, elements[b]), len(elements))
     m = torch.from_numpy(np.stack([end[3][:N] for end in ends])).reshape(*batch, N)
     P = torch.from_numpy(np.stack([end[4][:N, :N] for end in ends])).reshape(*batch, N, N)
     return JointState(assembly.known_state + m, P)
@@ -172,7 +172,7 @@ def smoothed_layers(
     joined = (torch.cat(rows, -2) if rows else nothing).contiguous().numpy()
 
     def one(b: int) -> tuple[np.ndarray, np.ndarray]:
-        _, means, covariances, _, _ = recursion.run(problem.layout, elements[b])
+        _, means, covariances, _, _ = filtering.run(problem.layout, elements[b])
         mean, variance = smoothing.smooth(
             problem.layout, elements[b], joined[b], means, covariances
         )

@@ -27,7 +27,7 @@ from pyro_dynogp.inference.refit import optima_of, refit
 from pyro_dynogp.models.assembly import assemble
 from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.collapsed import outputs_with_gaps
-from pyro_dynogp.moments import recursion, smoothing
+from pyro_dynogp.moments import filtering, smoothing
 from pyro_dynogp.moments.problem import each
 from tests.conftest import simulate_record
 
@@ -167,7 +167,7 @@ def _smoothed(observed: Any, y: torch.Tensor) -> tuple[np.ndarray, np.ndarray, n
 
     def moments(b: int) -> np.ndarray:
         one = elements[b]
-        _, means, covariances, _, _ = recursion.run(layout, one)
+        _, means, covariances, _, _ = filtering.run(layout, one)
         mean, variance, _ = smoothing.leave_one_out(layout, one, means, covariances)
         gain = variance / (variance + one.R)
         return np.stack([mean + gain * (one.y - mean), (1.0 - gain) * variance, one.R + 0.0 * mean])

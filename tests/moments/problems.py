@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from pyro_dynogp.layers.noise import student_components
-from pyro_dynogp.moments.blocks import Values
 from pyro_dynogp.moments.functions import KERNELS
+from pyro_dynogp.moments.layout import Values
 from pyro_dynogp.moments.problem import TABLE, FilterProblem, make_layout
 
 # What may move: y is measured, but its gradient is used where outputs are scaled.

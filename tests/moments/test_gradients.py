@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from pyro_dynogp.moments.blocks import Values
+from pyro_dynogp.moments.filtering import SEGMENT
+from pyro_dynogp.moments.layout import Values
 from pyro_dynogp.moments.problem import _EVENTS, log_density
-from pyro_dynogp.moments.recursion import SEGMENT
 from tests.moments import oracles
 from tests.moments.problems import (
     LINE,

@@ -10,11 +10,10 @@ from hypothesis import strategies as st
 from scipy.stats import norm
 
 from pyro_dynogp.layers.noise import student_components
-from pyro_dynogp.moments import recursion, smoothing
-from pyro_dynogp.moments.blocks import Values, workspace
+from pyro_dynogp.moments import filtering, smoothing
+from pyro_dynogp.moments.layout import Values, workspace, zero_bars
 from pyro_dynogp.moments.measured_function import function_adjoint, function_moments, function_terms
 from pyro_dynogp.moments.problem import TABLE, log_density, make_layout
-from pyro_dynogp.moments.recursion import zero_bars
 from tests.moments import oracles
 from tests.moments.problems import LINE, WIDE, Block, element, random_problem
 from tests.moments.wiener import FUNCTIONS, GRID, HIGH, LOW, Wiener
@@ -174,7 +173,7 @@ def test_a_linear_function_gives_what_joint_moments_give():
     for measured in (False, True):
         problem = replace(wiener.problem(measured), table_mean=(1.2 * grid + 0.1)[None])
         values = element(problem)
-        total, means, covariances, m, P = recursion.run(problem.layout, values)
+        total, means, covariances, m, P = filtering.run(problem.layout, values)
         rows = np.array([[*wiener.system.C[0], 0.0]])
         smooth = smoothing.smooth(problem.layout, values, rows, means, covariances)
         out = smoothing.leave_one_out(problem.layout, values, means, covariances)

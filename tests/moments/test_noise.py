@@ -12,8 +12,8 @@ from scipy.stats import norm, t
 import pyro_dynogp as dgp
 from pyro_dynogp.layers.noise import Gaussian, StudentT, student_components
 from pyro_dynogp.lti.dense import signal_covariance
+from pyro_dynogp.moments.noise import noise_adjoint, noise_terms
 from pyro_dynogp.moments.problem import log_density
-from pyro_dynogp.moments.recursion import noise_adjoint, noise_terms
 from tests.conftest import simulate_record
 from tests.lti import oracles
 from tests.lti.oracles import tensor

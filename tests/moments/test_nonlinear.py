@@ -17,7 +17,7 @@ import torch
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from pyro_dynogp.moments import recursion, smoothing
+from pyro_dynogp.moments import filtering, smoothing
 from pyro_dynogp.moments.problem import log_density
 from tests.moments import oracles
 from tests.moments.problems import element
@@ -38,7 +38,7 @@ def smoothed(w, measured):
     problem = w.problem(measured)
     values = element(problem)
     row = np.array([[*w.system.C[0], 0.0]])
-    _, means, covariances, _, _ = recursion.run(problem.layout, values)
+    _, means, covariances, _, _ = filtering.run(problem.layout, values)
     mean, variance = smoothing.smooth(problem.layout, values, row, means, covariances)
     linear = oracles.run(problem.layout, values, oracles.linearised)
     linear_mean, _ = oracles.smooth(problem.layout, values, linear)
@@ -203,7 +203,7 @@ def test_leave_one_out_density_by_brute_force(name, measured, error):
         w = Wiener(name, 4, seed=seed)
         problem = w.problem(measured)
         values = element(problem)
-        _, means, covariances, _, _ = recursion.run(problem.layout, values)
+        _, means, covariances, _, _ = filtering.run(problem.layout, values)
         found = smoothing.leave_one_out(problem.layout, values, means, covariances)
         ours.append(found[2][:, 0])
         noise = w.noise_sd**2

@@ -6,8 +6,8 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from pyro_dynogp.moments import recursion, smoothing
-from pyro_dynogp.moments.recursion import SEGMENT
+from pyro_dynogp.moments import filtering, smoothing
+from pyro_dynogp.moments.filtering import SEGMENT
 from tests.lti.oracles import assert_close
 from tests.moments import oracles
 from tests.moments.problems import LINE, WIDE, Block, element, random_problem
@@ -37,7 +37,7 @@ def test_smoothed_moments(name):
     layout, values, plain = filtered(name)
     A = values.G.shape[1]
     rows = np.concatenate([np.eye(A), np.random.default_rng(0).standard_normal((2, A))])
-    _, means, covariances, _, _ = recursion.run(layout, values)
+    _, means, covariances, _, _ = filtering.run(layout, values)
     mean, variance = smoothing.smooth(layout, values, rows, means, covariances)
     exact_mean, exact = oracles.smooth(layout, values, plain)
     assert_close(mean, exact_mean, rtol=1e-8)
@@ -47,7 +47,7 @@ def test_smoothed_moments(name):
 @pytest.mark.parametrize("name", CASES)
 def test_last_state(name):
     layout, values, plain = filtered(name)
-    _, means, covariances, m, P = recursion.run(layout, values)
+    _, means, covariances, m, P = filtering.run(layout, values)
     assert_close(m, plain.after[-1][0], rtol=1e-9)
     assert_close(P, plain.after[-1][1], rtol=1e-9)
     N = len(values.m0)
@@ -100,7 +100,7 @@ def test_smoothing_narrows_and_needs_no_process_noise():
     layout, values, _ = filtered("table")
     flat = values._replace(Q=np.zeros_like(values.Q), P0=np.outer(*[np.arange(1.0, 5.0)] * 2) / 20)
     rows = np.eye(values.G.shape[1])
-    _, means, covariances, _, _ = recursion.run(layout, flat)
+    _, means, covariances, _, _ = filtering.run(layout, flat)
     mean, variance = smoothing.smooth(layout, flat, rows, means, covariances)
     filtered_variance = np.array([np.diag(P) for _, P in oracles.run(layout, flat).after])
     assert np.isfinite(mean).all()
