@@ -10,9 +10,9 @@ import torch
 
 from pyro_dynogp.discrepancy.extend import Model, has_function
 from pyro_dynogp.inference.cascade_fit import climb, grow, starting_points
-from pyro_dynogp.inference.cascade_starts import Values
 from pyro_dynogp.inference.checkpoints import NOTHING_KEPT
 from pyro_dynogp.inference.descent import descend
+from pyro_dynogp.inference.dynamic_starts import Values
 from pyro_dynogp.inference.fit import at_optimum
 from pyro_dynogp.inference.lockstep import Functions
 from pyro_dynogp.inference.maximum import Optimum, maximise

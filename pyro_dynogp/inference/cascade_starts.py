@@ -11,25 +11,19 @@ import pyro
 import torch
 from torch import Tensor
 
-from pyro_dynogp.inference.starts import random_poles
-from pyro_dynogp.layers.functions import StaticFunction
+from pyro_dynogp.inference.dynamic_starts import DynamicStart, Values
+from pyro_dynogp.inference.static_starts import start_static
 from pyro_dynogp.layers.noise import TYPICAL
 from pyro_dynogp.lti.grid import time_grid
-from pyro_dynogp.lti.response import mean_response
 from pyro_dynogp.models.assembly import assemble
 from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.layers import INPUTS, Dynamic, Static, Wire
 from pyro_dynogp.models.linear import LinearDynamicGP
-from pyro_dynogp.models.priors import TimeScale
 from pyro_dynogp.models.systems import DynamicSystem, scaled_inputs, see
 from pyro_dynogp.moments import filtering, smoothing
 from pyro_dynogp.parallel import child_seeds
 from pyro_dynogp.record import Record
 from pyro_dynogp.scaling import Scaling
-
-Values = dict[str, Tensor]
-# Size of gains that are there to be learnt.
-SMALL = 0.05
 
 
 def linear_twin(model: Cascade, layer: Dynamic, scaling: Scaling) -> LinearDynamicGP:
@@ -132,7 +126,7 @@ def starting_point(
     for one in model.wires:
         seen = [see(s, one) for s in signals]
         if isinstance(one.layer, Dynamic):
-            start = _Dynamic(model, one, one.layer, scaling, generator)
+            start = DynamicStart(model, one, one.layer, scaling, generator)
             if one.name == plan.leading and plan.linear is not None:
                 values.update(start.from_linear(plan.linear))
             else:
@@ -149,7 +143,7 @@ def starting_point(
             line = (size, level) if one.last else None
             curve = torch.cat(targets) if one.last and plan.curved else None
             reach = torch.cat(targets) if one.last else None
-            outputs = _static(model, one, one.layer, values, seen, line, curve, reach)
+            outputs = start_static(model, one, one.layer, values, seen, line, curve, reach)
         for signal, out in zip(signals, outputs, strict=True):
             signal[one.name] = out
     last = model.wires[-1].name
@@ -244,185 +238,3 @@ def _complete(model: Cascade, scaling: Scaling, values: Values) -> None:
 def _scaled_outputs(scaling: Scaling, record: Record) -> Tensor:
     y = (record.outputs - scaling.output_offset) / scaling.output_scale
     return torch.tensor(y, dtype=torch.float64)
-
-
-class _Dynamic:
-    """Starting values of one dynamic layer."""
-
-    def __init__(
-        self,
-        model: Cascade,
-        one: Wire,
-        layer: Dynamic,
-        scaling: Scaling,
-        generator: np.random.Generator,
-    ) -> None:
-        self.model, self.one, self.layer = model, one, layer
-        self.scaling, self.generator = scaling, generator
-
-    def key(self, name: str) -> str:
-        return f"{self.one.name}_{name}"
-
-    def random(self, *shape: int, scale: float = SMALL) -> Tensor:
-        return torch.tensor(scale * self.generator.standard_normal(shape), dtype=torch.float64)
-
-    def from_linear(self, linear: Mapping[str, Tensor]) -> Values:
-        """The linear optimum's values under this layer's names."""
-        values = {
-            self.one.name + name[1:]: value for name, value in linear.items() if name[:2] == "g_"
-        }
-        layer = self.layer
-        if layer.outputs > 1 and self.key("output_gain") not in values:
-            # One signal is the linear fit; the others see the same modes with other gains.
-            P = layer.pairs
-            gain = self.random(layer.outputs, P, 2, scale=0.7)
-            gain[0] = torch.tensor([1.0, 0.0], dtype=torch.float64)
-            values[self.key("output_gain")] = gain
-            length = gain.square().sum((0, -1)).sqrt()  # directions have unit length
-            values[self.key("input_gain")] = values[self.key("input_gain")] * length[:, None, None]
-            if layer.feedthrough:
-                D = values[self.key("feedthrough")]
-                rest = self.random(layer.outputs - 1, D.shape[-1], scale=0.1)
-                values[self.key("feedthrough")] = torch.cat([D.reshape(1, -1), rest])
-            if layer.process_noise:
-                values.update(self.small_noise())
-        if not layer.process_noise:
-            values = {k: v for k, v in values.items() if "_noise_gain" not in k}
-        return values
-
-    def near_identity(self) -> Values:
-        """Each output is an input, beside small random dynamics."""
-        layer, d = self.layer, self.one.channels
-        P, several = layer.pairs, layer.outputs > 1
-        rate = TimeScale.of(self.scaling).typical_rate
-        poles = random_poles(P, self.scaling, self.generator)
-        values = {
-            self.key("log_decay"): torch.tensor(np.log(-poles.real / rate)),
-            self.key("log_frequency"): torch.tensor(np.log(poles.imag / rate)),
-        }
-        if d:
-            values[self.key("input_gain")] = self.random(P, d, 2)
-            if layer.feedthrough:
-                D = torch.eye(layer.outputs, d, dtype=torch.float64)
-                D = D + self.random(layer.outputs, d)
-                values[self.key("feedthrough")] = D if several else D[0]
-            else:  # the fastest pair passes the first input on
-                fastest = int(np.argmax(np.abs(poles)))
-                values[self.key("input_gain")][fastest, 0, 1] = 1.0
-        if several:
-            gain = self.random(layer.outputs, P, 2, scale=0.7)
-            gain[0] = gain[0] + torch.tensor([1.0, 0.0], dtype=torch.float64)
-            values[self.key("output_gain")] = gain
-        if layer.process_noise:
-            values.update(self.small_noise())
-        return values
-
-    def small_noise(self) -> Values:
-        layer = self.layer
-        count = layer.brownian or layer.outputs
-        return {
-            self.key("noise_gain_local_scale"): torch.full((layer.pairs,), 0.5).double(),
-            self.key("noise_gain_unit"): self.random(layer.pairs, count, 2, scale=0.3).abs() + 0.05,
-        }
-
-    def response(self, values: Values, record: Record, x: Tensor) -> Tensor:
-        """Mean trajectory (n, w) of the layer."""
-        with torch.no_grad(), pyro.poutine.block():
-            sample = pyro.poutine.condition(self.model.sample_dynamic_layer, data=values)
-            modes = sample(self.one, self.layer, TimeScale.of(self.scaling)).modes
-            out = mean_response(modes, record.time, x if modes.inputs else None).output
-        return out if modes.several_outputs else out.unsqueeze(-1)
-
-    def scale(self, values: Values, factor: float) -> None:
-        """Multiply the layer's output."""
-        for name in ("input_gain", "feedthrough", "noise_gain_unit"):
-            if self.key(name) in values:
-                values[self.key(name)] = values[self.key(name)] * factor
-
-
-def _static(
-    model: Cascade,
-    one: Wire,
-    layer: Static,
-    values: Values,
-    seen: Sequence[Tensor],
-    line: tuple[float, Tensor] | None,
-    curve: Tensor | None,
-    reach: Tensor | None,
-) -> list[Tensor]:
-    """Add a static layer's values; its outputs along the mean trajectories.
-
-    Args:
-        line: slope and level (e,) of the function, None for the identity.
-        curve: (n, e) what its outputs should be on average; None for a straight line.
-        reach: (n, e) outputs that the straight line should be able to reach, or None.
-    """
-    x = torch.cat(list(seen))
-    d, e, M = one.channels, layer.outputs, layer.inducing
-    low, high = x.amin(0), x.amax(0)
-    if reach is not None and line is not None and d == 1:
-        # Process noise takes the input further than its mean goes: to where the outputs came from.
-        back = (reach - line[1]) / line[0]
-        back = back[torch.isfinite(back)]
-        low, high = torch.minimum(low, back.amin()), torch.maximum(high, back.amax())
-    margin = 0.2 * (high - low) + 1e-3
-    low, high = low - margin, high + margin
-    name = one.name
-    if not layer.learn_locations:
-        pass
-    elif d == 1:
-        values[f"{name}_center"] = 0.5 * (low + high)
-        values[f"{name}_half_width"] = 0.5 * (high - low)
-    else:  # where the data are, spread along the record
-        index = torch.linspace(0, len(x) - 1, M).round().long()
-        cloud = torch.quasirandom.SobolEngine(d).draw(M, dtype=torch.float64) - 0.5
-        values[f"{name}_locations"] = x[index] + 0.1 * (high - low) * cloud
-    values[f"{name}_constant"] = torch.zeros(e, dtype=torch.float64)
-    values[f"{name}_output_scale"] = torch.full((e,), 1.5, dtype=torch.float64)
-    if layer.mean == "linear":
-        values[f"{name}_slope"] = torch.eye(e, d, dtype=torch.float64)
-    if layer.kernel is None:
-        spread = (high - low) / (4.0 if d == 1 else 1.5)
-        values[f"{name}_lengthscale"] = spread.clamp(0.1, 10.0)
-    values[f"{name}_values"] = torch.zeros(e, M, dtype=torch.float64)
-    function = _function(model, one, layer, values)
-    Z = function.locations
-    u = torch.stack([Z[:, o % d] for o in range(e)])
-    if line is not None:
-        u = line[0] * u + line[1].unsqueeze(-1)
-    if curve is not None and d == 1:
-        u = torch.stack([_smooth_means(x[:, 0], curve[:, o], Z[:, 0]) for o in range(e)])
-    values[f"{name}_values"] = _whiten(function, u)
-    function = _function(model, one, layer, values)
-    with torch.no_grad():
-        return [function.mean(s) for s in seen]
-
-
-def _function(model: Cascade, one: Wire, layer: Static, values: Values) -> StaticFunction:
-    with torch.no_grad():
-        return model.static_given(one, layer, values)
-
-
-def _whiten(function: StaticFunction, u: Tensor) -> Tensor:
-    """Whitened values v (e, M) with which the function has the values u (e, M) at its locations."""
-    prior = function.prior_mean(function.locations).mT
-    centred = (u - prior) / function.output_scale.unsqueeze(-1)
-    K = function.kernel(function.locations, function.locations)
-    # A start need not interpolate: rough targets would ask for values that the prior rules out.
-    M = K.shape[-1]
-    ridge = 1e-3 * torch.eye(M, dtype=K.dtype)
-    smooth = (K @ torch.linalg.solve(K + ridge, centred.unsqueeze(-1))).squeeze(-1)
-    root = torch.linalg.cholesky(K + 1e-6 * torch.eye(M, dtype=K.dtype))
-    return torch.linalg.solve_triangular(root, smooth.unsqueeze(-1), upper=False).squeeze(-1)
-
-
-def _smooth_means(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-    """Mean of y given x at points z: a kernel smoother that leans on the straight line."""
-    there = torch.isfinite(y)
-    x, y = x[there], y[there]
-    slope = ((x - x.mean()) * (y - y.mean())).mean() / (x.var() + 1e-9)
-    width = (x.amax() - x.amin()) / 16.0 + 1e-9
-    weight = torch.exp(-0.5 * ((z[:, None] - x) / width).square())
-    line = slope * (x - x.mean()) + y.mean()
-    departure = (weight @ (y - line)) / (weight.sum(-1) + 1.0)
-    return slope * (z - x.mean()) + y.mean() + departure
