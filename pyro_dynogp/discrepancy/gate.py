@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy import stats
 
 from pyro_dynogp.discrepancy.evidence import Residuals
+from pyro_dynogp.discrepancy.interactions import interactions
 from pyro_dynogp.discrepancy.paths import looked_at, own
 from pyro_dynogp.discrepancy.responses import responses, standardised
 from pyro_dynogp.discrepancy.scan import tail_probability
@@ -19,17 +22,22 @@ BATCHES = 8
 LEVEL = 0.05
 
 
-def structure_left(residuals: Residuals, seed: int = 0) -> tuple[float, str]:
-    """Test whether anything is left in a residual, in four independent ways.
+def structure_left(
+    residuals: Residuals, plain: Residuals | None = None, seed: int = 0
+) -> tuple[float, str]:
+    """Test whether anything is left in a residual, in five ways.
 
     1. Held-out one-step errors depend on earlier ones; 2. so does their size; 3. their
     distribution is not normal; 4. the held-out residual follows linear responses of inputs or
-    candidates, of their squares and cubes, or slow functions of time. Each is calibrated by
-    simulation or permutation; the smallest of the four p-values is paid for by Sidak's formula,
+    candidates, of their squares and cubes, or slow functions of time; 5. it follows products of
+    inputs at two times, or responses that change with time (`interactions`). Each is calibrated by
+    simulation or permutation; the smallest of the five p-values is paid for by Sidak's formula,
     which is exact where they are independent and safe where they go together.
 
     Args:
-        residuals: of one output (n,). seed: of the simulated nulls.
+        residuals: of one output (n,). plain: those of the model without its process noise, which
+            takes up what should be left; where there are any the fifth way looks at these.
+        seed: of the simulated nulls.
 
     Returns:
         Probability of as much structure where there is none, and a sentence.
@@ -49,6 +57,9 @@ def structure_left(residuals: Residuals, seed: int = 0) -> tuple[float, str]:
         )[1],
         "one-step errors are not normal": _not_normal(v[np.isfinite(v)], seed),
         "the residual follows inputs, other channels or time": _follows(r, seed),
+        "the residual follows products of inputs at two times, or a response that changes": (
+            _interacts(plain or r, seed)
+        ),
     }
     smallest = min(ways.values())
     p_value = float(-np.expm1(len(ways) * np.log1p(-min(smallest, 1.0 - 1e-12))))
@@ -82,18 +93,33 @@ def _anderson_darling(x: np.ndarray) -> np.ndarray:
 
 def _follows(r: Residuals, seed: int) -> float:
     """Probability of as much that inputs, candidates, their powers or time explain."""
-    x = np.where(r.held_out, r.residual, np.nan)
     each = looked_at(r) // (16 * max(len(r.input_names) + len(r.candidates), 1))
     constants = int(np.clip(each, 1, 4))
-    t = (r.time - r.time[0]) / (r.time[-1] - r.time[0])
-    slow = np.cos(np.pi * t[:, None] * np.arange(1, 5))
-    blocks = [own(r), slow]
+    blocks = [own(r), _slow(r)]
     for signal in [r.mean, *r.inputs.T, *r.candidates.values()]:
         u = held(signal)
         if np.std(u) > 0:
             blocks.append(responses(hermite(u), r.step, r.time, constants=constants))
     for signal in r.candidates.values():
         blocks.append(responses(held(signal), r.step, r.time, constants=constants))
+    return _explained(r, blocks, seed)
+
+
+def _interacts(r: Residuals, seed: int) -> float:
+    """Probability of as much that products of inputs, or changing responses, explain."""
+    blocks = interactions(r)
+    return _explained(r, blocks, seed) if blocks else 1.0
+
+
+def _slow(r: Residuals) -> np.ndarray:
+    """Slow functions of time (n, 4)."""
+    t = (r.time - r.time[0]) / (r.time[-1] - r.time[0])
+    return np.cos(np.pi * t[:, None] * np.arange(1, 5))
+
+
+def _explained(r: Residuals, blocks: Sequence[np.ndarray], seed: int) -> float:
+    """Probability of as much that one of several blocks of columns explains."""
+    x = np.where(r.held_out, r.residual, np.nan)
     ends = np.cumsum([b.shape[1] for b in blocks])
     variants = [np.arange(e - b.shape[1], e) for b, e in zip(blocks, ends, strict=True)]
     columns = standardised(np.column_stack(blocks))
@@ -102,7 +128,7 @@ def _follows(r: Residuals, seed: int) -> float:
         columns_score(columns, variants, spanning(columns[:, :0]), ~np.isfinite(x)),
         np.array([len(v) for v in variants]),
         deviations=r.deviations,
-        first=slow,
+        first=_slow(r),
         replicates=replicates(len(r), columns.shape[1]),
         seed=seed,
     )

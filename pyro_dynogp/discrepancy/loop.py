@@ -54,12 +54,12 @@ def close_loop(
 
     Block A is what the model is fitted to, B is searched, C is opened once, at the end. A round
     first asks whether there is any structure in the residuals at all (an omnibus test, or a false
-    discovery rate below `level` for one effect); if so, effects whose test rejects at `level`, and
-    their nearest relatives, are added to the model one at a time and fitted to A; the one that
-    raises the log-density of held-out data most is kept if it does so by more than two block
-    standard errors and 4 nats (or, as outliers make both large, with no sample counted for more
-    than 10 nats), effects between inputs and output before those of the noise, which their lack
-    imitates. Of effects that explain as much the one that leaves least open is kept, and
+    discovery rate of one effect, at half of `level` each); if so, effects whose test rejects at
+    `level`, and their nearest relatives, are added to the model one at a time and fitted to A; the
+    one that raises the log-density of held-out data most is kept if it does so by more than two
+    block standard errors and 4 nats (or, as outliers make both large, with no sample counted for
+    more than 10 nats), effects between inputs and output before those of the noise, which their
+    lack imitates. Of effects that explain as much the one that leaves least open is kept, and
     the others are reported as ties. Rounds end where nothing is left, or nothing helps. An effect
     that no block mends (feedback) is among the report's effects, after those that were added.
 
@@ -98,17 +98,18 @@ def close_loop(
     accepted: list[tuple[Found, Confirmed]] = []
     reported: list[Found] = []
     warnings: list[str] = []
-    left = False
+    left: tuple[str, ...] = ()
     for number in range(1, max_rounds + 1):
         known = {one.effect.name for one, _ in accepted}
-        residuals, found, notes = rounds.look(current, known)
+        looked = rounds.look(current, known)
         watch.stop("residual tests")
         if number == 1:
-            warnings += [*_faults(residuals, data.known), *notes]
-        reported = _reported(found, level)
-        left = rounds.structure(residuals, found)
-        chosen = candidates_of(found, model, data.known, level, tries) if left else []
-        attempts += _untried(found, chosen, level, number)
+            warnings += [*_faults(looked.residuals, data.known), *looked.notes]
+        reported = _reported(looked.found, level)
+        left = rounds.left(looked)
+        watch.stop("residual tests")
+        chosen = candidates_of(looked.found, model, data.known, level, tries) if left else []
+        attempts += _untried(looked.found, chosen, level, number)
         if not chosen:
             break
         confirmed = rounds.confirm(chosen, current, number)
@@ -126,9 +127,9 @@ def close_loop(
             current = quick_fit(model, training, seed, current)
         watch.stop("refits")
     else:  # rounds are spent; whether something is left is still to be said
-        residuals, found, _ = rounds.look(current, {one.effect.name for one, _ in accepted})
-        left = rounds.structure(residuals, found)
-        reported = _reported(found, level)
+        looked = rounds.look(current, {one.effect.name for one, _ in accepted})
+        left = rounds.left(looked)
+        reported = _reported(looked.found, level)
         watch.stop("residual tests")
     fits = [first, current] if accepted else [first]
     fitted = _final(fits, data.known, workers, progress)

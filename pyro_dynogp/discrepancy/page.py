@@ -59,6 +59,7 @@ def page(report: Report) -> str:
     subject = f"{about} of record “{name}”" if name else about
     sections = [
         ("What was missing", effects(report)),
+        *([("What is left", items(report.left))] if report.left else []),
         ("The model", _models(report)),
         ("How well it predicts", scores(report)),
         ("Tests", tests(report)),

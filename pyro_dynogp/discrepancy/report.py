@@ -90,7 +90,8 @@ class Report:
         elpd_gain, elpd_gain_error: elpd on C after less before, block standard error [nats].
         fit: the extended fit (the model given where nothing was added), of A and B.
         base: the model given, fitted to A and B.
-        attempts: all that was considered. warnings: sentences for the reader.
+        attempts: all that was considered. left: what structure is left at the end, in words; empty
+            where none is. warnings: sentences for the reader.
         data: which part was for what. tests: p-value of each test on C before and after, by effect.
         sealed: block C. known: blocks A and B.
         forecast_before, forecast_after: of C.
@@ -107,6 +108,7 @@ class Report:
     fit: Fit
     base: Fit
     attempts: tuple[Attempt, ...]
+    left: tuple[str, ...]
     warnings: tuple[str, ...]
     data: str
     tests: Mapping[str, tuple[float, float]]
@@ -129,6 +131,7 @@ class Report:
             "elpd_gain_error": self.elpd_gain_error,
             "tests": {name: list(pair) for name, pair in self.tests.items()},
             "attempts": [_plain(one) for one in self.attempts],
+            "left": list(self.left),
             "warnings": list(self.warnings),
             "data": self.data,
             "model_before": list(self.model_before),
@@ -161,7 +164,7 @@ class Report:
             lines.append(f"{name:<12} {pair}")
         gain, error = self.elpd_gain, self.elpd_gain_error
         lines.append(f"elpd         after less before {gain:.1f} +- {error:.1f} nats")
-        return "\n".join([*lines, *self.warnings])
+        return "\n".join([*lines, *self.left, *self.warnings])
 
 
 def _plain(one: Any) -> Any:

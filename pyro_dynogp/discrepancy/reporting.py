@@ -36,7 +36,7 @@ def report_of(
     reported: Sequence[Found],
     attempts: Sequence[Attempt],
     warnings: Sequence[str],
-    left: bool,
+    left: tuple[str, ...],
     watch: Stopwatch,
 ) -> Report:
     """Open block C, once."""
@@ -59,7 +59,7 @@ def report_of(
     watch.stop("numbers of the effects")
     return Report(
         effects=(*effects, *(_only_reported(f) for f in reported)),
-        outcome=_outcome(bool(accepted), left),
+        outcome=_outcome(bool(accepted), bool(left)),
         before=before,
         after=after,
         elpd_gain=float(gain.sum()),
@@ -67,6 +67,7 @@ def report_of(
         fit=extended,
         base=base,
         attempts=tuple(attempts),
+        left=left,
         warnings=tuple(warnings),
         data=data.sentence,
         tests=tests,

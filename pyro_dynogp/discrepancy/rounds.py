@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -45,6 +46,22 @@ class Stopwatch:
         self._last = now
 
 
+@dataclass(frozen=True, eq=False)
+class Looked:
+    """What a round sees.
+
+    Attributes:
+        residuals: of every output. plain: those of the model without its process noise; the same
+            ones where it has none.
+        found: evidence of all effects but those that are known. notes: what else there is to say.
+    """
+
+    residuals: Sequence[Residuals]
+    plain: Sequence[Residuals]
+    found: Sequence[Found]
+    notes: Sequence[str]
+
+
 class Rounds:
     """One after the other on the same data, with the same options.
 
@@ -79,15 +96,13 @@ class Rounds:
             for a in range(record.n_outputs)
         ]
 
-    def look(
-        self, fit: Fit, known: Collection[str]
-    ) -> tuple[list[Residuals], list[Found], list[str]]:
-        """Residuals, evidence of all effects but those that are known, what else there is to say.
+    def look(self, fit: Fit, known: Collection[str]) -> Looked:
+        """Residuals, and evidence of all effects but those that are known.
 
         Process noise can take up what inputs do, and a simulation with it explains less than it
         could: what goes with inputs is looked for in the residuals of a fit without it, too.
         """
-        residuals = self.residuals(fit, self.data.known, self.held_out)
+        residuals = others = self.residuals(fit, self.data.known, self.held_out)
         effects = [e for e in self.effects if not (e.once and e.name in known)]
         options: dict[str, Any] = {
             "seed": self.seed, "workers": self.workers, "progress": self.progress,
@@ -102,7 +117,7 @@ class Rounds:
             found = merged(found, look(others, structural, **options)[0])
             if not known:  # of the model as given
                 notes += self.hiding(fit, again)
-        return residuals, found, notes
+        return Looked(residuals, others, found, notes)
 
     def hiding(self, fit: Fit, plain: Fit) -> list[str]:
         """In words, whether a model forecasts held-out data better without its process noise."""
@@ -144,9 +159,19 @@ class Rounds:
         self.held_out = shared(self.held_out)
         return True
 
-    def structure(self, residuals: Sequence[Residuals], found: Sequence[Found]) -> bool:
-        """Whether anything is left: by the omnibus test, or by one of the others, all paid for."""
-        if min((f.q_value for f in found), default=1.0) < self.level:
-            return True
-        omnibus = min(structure_left(one, seed=self.seed)[0] for one in residuals)
-        return min(1.0, omnibus * len(residuals)) < self.level
+    def left(self, looked: Looked) -> tuple[str, ...]:
+        """What is left, in words: empty where nothing is.
+
+        By the tests of single effects, all paid for, or else by the omnibus test: each has half of
+        the level.
+        """
+        level = self.level / 2.0
+        named = {f.effect.name: f.q_value for f in looked.found if f.q_value < level}
+        if named:
+            rates = ", ".join(f"{name} ({q:.2g})" for name, q in named.items())
+            return (f"Residual tests speak for (false discovery rate): {rates}.",)
+        omnibus = [
+            structure_left(one, other, seed=self.seed)
+            for one, other in zip(looked.residuals, looked.plain, strict=True)
+        ]
+        return tuple(said for p, said in omnibus if p * len(omnibus) < level)

@@ -126,6 +126,7 @@ def report(n=400, outputs=1, seed=0, **changes):
         "elpd_gain": 61.2, "elpd_gain_error": 9.8,
         "fit": SimpleNamespace(), "base": SimpleNamespace(),
         "attempts": attempts(),
+        "left": (),
         "warnings": ("The inputs hardly excite frequencies above 0.2 rad/s.",),
         "data": "Fitted to 200 samples, searched on the 100 after them, reported on the last 100.",
         "tests": {"extra input: ambient": (0.0004, 0.41), "dead time": (0.02, 0.33),

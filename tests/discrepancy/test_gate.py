@@ -7,7 +7,7 @@ from scipy.signal import lfilter
 from pyro_dynogp.discrepancy import sieve
 from pyro_dynogp.discrepancy.gate import structure_left
 
-from .series import check_rate, in_other_units, residuals
+from .series import check_rate, in_other_units, residuals, share
 
 
 def test_level_is_kept(monkeypatch):
@@ -29,6 +29,8 @@ def test_nothing_left_is_said():
         (lambda t, mean, u: 0.3 * mean**2, "follows inputs"),
         (lambda t, mean, u: 0.5 * lfilter([0.0, 0.2], [1.0, -0.9], u[:, 0]), "follows inputs"),
         (lambda t, mean, u: 2.0 * (t > 100.0), "follows inputs, other channels or time"),
+        (lambda t, mean, u: share(u[:, 0] * np.roll(u[:, 0], 6), 0.3), "products of inputs"),
+        (lambda t, mean, u: 0.8 * np.sin(t / 16.0) * mean, "a response that changes"),
     ],
 )
 def test_missing_terms_are_seen(effect, said):
@@ -69,3 +71,10 @@ def test_missing_samples_and_too_few():
     assert structure_left(dataclasses.replace(r, output=output))[0] < 0.01
     with pytest.raises(ValueError, match="30"):
         structure_left(dataclasses.replace(r, held_out=np.arange(400) > 380))
+
+
+def test_the_model_without_process_noise_shows_what_it_took_up():
+    r = residuals(3, 400)
+    plain = residuals(3, 400, effect=lambda t, mean, u: share(u[:, 0] * np.roll(u[:, 0], 6), 0.3))
+    assert structure_left(r)[0] > 0.05
+    assert structure_left(r, plain)[0] < 0.01

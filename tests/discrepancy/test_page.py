@@ -203,6 +203,9 @@ def test_structure_left_and_outcomes_of_ones_own():
     _, found = checked(reports.nothing(outcome="structure left, cause unknown", warnings=("W.",)))
     assert "leaves structure in the data that no effect in the catalogue explains." in found.text
     assert "Warnings W." in found.text
+    assert "What is left Structure" not in found.text
+    _, found = checked(reports.report(left=("Structure is left: a < b.",)))
+    assert "What is left Structure is left: a < b." in found.text
     assert _headline(reports.nothing(outcome="out of time")) == "Out of time."
 
 

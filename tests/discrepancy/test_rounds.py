@@ -41,5 +41,5 @@ def test_process_noise_that_costs_forecasts_is_pointed_out(late, noise, hides):
     assert bool(said) == hides, said
     if hides:
         assert "better without its process noise (elpd +" in said[0]
-        _, _, notes = rounds.look(quick_fit(MODEL, training, 0, fit), set())
-        assert any("process_noise=False" in one for one in notes)
+        looked = rounds.look(quick_fit(MODEL, training, 0, fit), set())
+        assert any("process_noise=False" in one for one in looked.notes)

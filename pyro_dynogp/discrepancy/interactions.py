@@ -1,0 +1,82 @@
+r"""Responses that no linear time-invariant system has, for the test whether anything is left.
+
+A smooth system departs from a linear one first by its response to products of inputs at two times
+(the second-order kernel of its Volterra series), one that changes by responses whose size or shape
+is another at another time. Each is looked for along the path that the model itself has: a product
+u_i(t) u_j(t - d), or an input times a slow function of time, takes the place of an input.
+
+Source: Schetzen, The Volterra and Wiener Theories of Nonlinear Systems (1980), ch. 3; Priestley,
+Non-linear and Non-stationary Time Series Analysis (1988), ch. 3.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from pyro_dynogp.discrepancy.evidence import Residuals
+from pyro_dynogp.discrepancy.paths import Paths, looked_at, paths
+from pyro_dynogp.discrepancy.responses import filtered, standardised
+from pyro_dynogp.signals import delayed
+
+# Delays between the factors of a product, from one step to a share of what is looked at, and to
+# so many steps.
+DELAYS, SHARE, LONGEST = 8, 0.15, 60
+# Cycles of slow cosines and sines over what is looked at.
+COSINES, SINES = (0.5, 1.0, 1.5, 2.0), (1.0, 2.0)
+# Inputs that are multiplied: those that do most.
+INPUTS = 3
+
+
+def interactions(residuals: Residuals) -> list[np.ndarray]:
+    """Columns (n, K) of each variant: standardised, zero where a signal does not move.
+
+    Args:
+        residuals: of one output; inputs without gaps.
+
+    Returns:
+        For each product and each changing signal: as it is, through a first-order lag of the
+        mean's own correlation time, and in the place of each of the (most effective) inputs.
+    """
+    r = residuals
+    path = paths(r)
+    leading = np.argsort(-path.shares.std(axis=0), kind="stable")[:INPUTS]
+    inputs = [u for u in standardised(r.inputs[:, np.sort(leading)]).T if u.any()]
+    lag = _correlation_time(r.mean) * r.step
+    signals = _products(inputs, r) + _changing([*inputs, *standardised(r.mean[:, None]).T], r)
+    return [_block(signal, path, leading[:2], lag) for signal in signals]
+
+
+def _products(inputs: list[np.ndarray], r: Residuals) -> list[np.ndarray]:
+    """Of two inputs, or of one at two times; squares are no part of it."""
+    longest = np.clip(SHARE * looked_at(r), 2, LONGEST)
+    steps = np.unique(np.round(np.geomspace(1, longest, DELAYS)).astype(int))
+    both = [a * b for a, b in itertools.combinations(inputs, 2)]
+    past = [delayed(b, r.time, d * r.step) for b in inputs for d in steps]
+    return both + [a * b for a, b in itertools.product(inputs, past)]
+
+
+def _changing(signals: list[np.ndarray], r: Residuals) -> list[np.ndarray]:
+    """Signals times slow waves over the stretch that is looked at."""
+    looked = r.time[r.held_out]
+    s = np.clip((r.time - looked[0]) / (looked[-1] - looked[0]), 0.0, 1.0)
+    waves = [np.cos(2.0 * np.pi * k * s) for k in COSINES]
+    waves += [np.sin(2.0 * np.pi * k * s) for k in SINES]
+    return [signal * wave for signal in signals if signal.any() for wave in waves]
+
+
+def _block(signal: np.ndarray, path: Paths, inputs: np.ndarray, lag: float) -> np.ndarray:
+    one = signal[:, None]
+    slow = filtered(one, path.step, path.time, np.array([-1.0 / lag]), lags=0)[:, 0]
+    return standardised(np.column_stack([slow, *(path(int(j), one)[:, 0] for j in inputs)]))
+
+
+def _correlation_time(mean: np.ndarray) -> int:
+    """Steps until the autocorrelation of a signal (n,) falls below one half, at least one."""
+    x = mean - mean.mean()
+    n = len(x)
+    power = np.abs(np.fft.rfft(x, 2 * n)) ** 2
+    correlation = np.fft.irfft(power)[:n]
+    below = np.flatnonzero(correlation < 0.5 * correlation[0])
+    return max(int(below[0]) if len(below) else 1, 1)
