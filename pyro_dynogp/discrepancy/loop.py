@@ -105,7 +105,7 @@ def close_loop(
         watch.stop("residual tests")
         if number == 1:
             warnings += [*_faults(looked.residuals, data.known), *looked.notes]
-        reported = _reported(looked.found, level)
+        reported = _reported(looked.found, rounds.gate)
         left = rounds.left(looked)
         watch.stop("residual tests")
         chosen = candidates_of(looked.found, model, data.known, level, tries) if left else []
@@ -129,7 +129,7 @@ def close_loop(
     else:  # rounds are spent; whether something is left is still to be said
         looked = rounds.look(current, {one.effect.name for one, _ in accepted})
         left = rounds.left(looked)
-        reported = _reported(looked.found, level)
+        reported = _reported(looked.found, rounds.gate)
         watch.stop("residual tests")
     fits = [first, current] if accepted else [first]
     fitted = _final(fits, data.known, workers, progress)

@@ -87,6 +87,11 @@ class Rounds:
         self.level, self.tries, self.effects = level, tries, effects
         self.workers, self.progress = workers, progress
 
+    @property
+    def gate(self) -> float:
+        """Level of each of the two answers to whether anything is left: that of both, halved."""
+        return self.level / 2.0
+
     def residuals(self, fit: Fit, record: Record, held_out: np.ndarray) -> list[Residuals]:
         """Of every output, with the candidates that the model does not use."""
         taken = used_channels(fit.model)
@@ -162,11 +167,9 @@ class Rounds:
     def left(self, looked: Looked) -> tuple[str, ...]:
         """What is left, in words: empty where nothing is.
 
-        By the tests of single effects, all paid for, or else by the omnibus test: each has half of
-        the level.
+        By the tests of single effects, all paid for, or else by the omnibus test.
         """
-        level = self.level / 2.0
-        named = {f.effect.name: f.q_value for f in looked.found if f.q_value < level}
+        named = {f.effect.name: f.q_value for f in looked.found if f.q_value <= self.gate}
         if named:
             rates = ", ".join(f"{name} ({q:.2g})" for name, q in named.items())
             return (f"Residual tests speak for (false discovery rate): {rates}.",)
@@ -174,4 +177,4 @@ class Rounds:
             structure_left(one, other, seed=self.seed)
             for one, other in zip(looked.residuals, looked.plain, strict=True)
         ]
-        return tuple(said for p, said in omnibus if p * len(omnibus) < level)
+        return tuple(said for p, said in omnibus if p * len(omnibus) <= self.gate)

@@ -1,4 +1,4 @@
-"""What is said of process noise that hides what is missing."""
+"""What rounds say: of process noise that hides what is missing, and of what is left."""
 
 from __future__ import annotations
 
@@ -9,10 +9,14 @@ from scipy.signal import lfilter
 import pyro_dynogp as dgp
 from pyro_dynogp.discrepancy import effects
 from pyro_dynogp.discrepancy.blocks import blocks_of
+from pyro_dynogp.discrepancy.evidence import Evidence
 from pyro_dynogp.discrepancy.extend import without_process_noise
 from pyro_dynogp.discrepancy.refits import quick_fit
-from pyro_dynogp.discrepancy.rounds import Rounds
+from pyro_dynogp.discrepancy.rounds import Looked, Rounds
+from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.discrepancy.trials import without
+
+from .series import residuals, share
 
 N = 480
 MODEL = dgp.LinearDynamicGP(1, pairs=1)
@@ -43,3 +47,21 @@ def test_process_noise_that_costs_forecasts_is_pointed_out(late, noise, hides):
         assert "better without its process noise (elpd +" in said[0]
         looked = rounds.look(quick_fit(MODEL, training, 0, fit), set())
         assert any("process_noise=False" in one for one in looked.notes)
+
+
+def test_what_is_left_is_said():
+    """By single effects where one is certain, else by the omnibus test; nothing where none is."""
+    record = oscillator(0, 0.0, seed=2)
+    fit = dgp.fit(MODEL, record[:240], restarts=1, workers=1, progress=False)
+    rounds = Rounds(blocks_of(fit, record, None), [], 0, 0.05, 8, (), 1, False)
+    quiet = residuals(3, 400)
+    product = residuals(3, 400, effect=lambda t, mean, u: share(u[:, 0] * np.roll(u[:, 0], 6), 0.3))
+    found = [
+        Found(effects.LevelShift(), Evidence("level shift", 1.0, q / 4, 3.0, 0.1), q)
+        for q in (0.03, 0.02)
+    ]
+    assert rounds.left(Looked([quiet], [quiet], [], [])) == ()
+    assert rounds.left(Looked([quiet], [quiet], found[:1], [])) == ()  # half of the level is 0.025
+    assert "level shift (0.02)" in rounds.left(Looked([quiet], [quiet], found, []))[0]
+    (said,) = rounds.left(Looked([quiet], [product], [], []))
+    assert "products of inputs" in said
