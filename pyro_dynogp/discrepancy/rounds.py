@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -62,30 +62,28 @@ class Looked:
     notes: Sequence[str]
 
 
+@dataclass(eq=False)
 class Rounds:
     """One after the other on the same data, with the same options.
 
     Attributes:
-        data: blocks. names: of candidate channels. held_out: (n,) samples of the known blocks
-            that no fit of a round sees.
+        data: blocks. names: of candidate channels.
         seed, level, tries, effects, workers, progress: as of `close_loop`.
+        held_out: (n,) samples of the known blocks that no fit of a round sees.
     """
 
-    def __init__(
-        self,
-        data: Blocks,
-        names: Sequence[str],
-        seed: int,
-        level: float,
-        tries: int,
-        effects: Sequence[Effect],
-        workers: int | None,
-        progress: bool,
-    ) -> None:
-        self.data, self.names, self.seed = data, names, seed
-        self.held_out = data.held_out
-        self.level, self.tries, self.effects = level, tries, effects
-        self.workers, self.progress = workers, progress
+    data: Blocks
+    names: Sequence[str]
+    seed: int
+    level: float
+    tries: int
+    effects: Sequence[Effect]
+    workers: int | None
+    progress: bool
+    held_out: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.held_out = self.data.held_out
 
     @property
     def gate(self) -> float:
