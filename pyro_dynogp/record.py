@@ -49,6 +49,14 @@ class RecordTensors:
     inputs: Tensor
     outputs: Tensor
 
+    @property
+    def observations(self) -> Tensor:
+        """Outputs as models observe them: (n,) of one output, (n, n_y) of several [output units].
+
+        NaN marks a missing sample.
+        """
+        return self.outputs if self.outputs.shape[1] != 1 else self.outputs[:, 0]
+
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
 class Record:

@@ -103,6 +103,13 @@ class TestContents:
         assert tensors.outputs[0] == 0.0
         np.testing.assert_array_equal(tensors.inputs.numpy(), record.inputs)
 
+    @pytest.mark.parametrize(("outputs", "shape"), [(0, (3, 0)), (1, (3,)), (2, (3, 2))])
+    def test_observations_of_one_output_are_a_series(self, outputs, shape):
+        record = Record([0, 1, 2], outputs=np.arange(3.0 * outputs).reshape(3, outputs))
+        found = record.tensors().observations
+        assert found.shape == shape
+        np.testing.assert_array_equal(found.reshape(3, -1).numpy(), record.outputs)
+
 
 class TestRefusals:
     def test_empty(self):

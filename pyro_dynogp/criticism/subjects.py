@@ -22,7 +22,7 @@ from pyro_dynogp.criticism.posterior_draws import (
 )
 from pyro_dynogp.inference.refit import refit
 from pyro_dynogp.models.cascade import Cascade
-from pyro_dynogp.models.collapsed import collapsed_of, outputs_with_gaps
+from pyro_dynogp.models.collapsed import collapsed_of
 from pyro_dynogp.prediction.linear import prior_process, process_given
 from pyro_dynogp.record import Record
 
@@ -151,7 +151,7 @@ def densities_at(
         observed: distribution of the outputs, of the fit with some of the draws.
         kind, horizon: see `pointwise_log_density`.
     """
-    y = outputs_with_gaps(record)
+    y = record.tensors().observations
     count = len(next(iter(values.values())))
     portion = max(1, AT_ONCE // (len(record) * record.n_outputs))
     parts = []

@@ -208,9 +208,7 @@ def one_step_density(fit: Fit, record: Record) -> np.ndarray:
         observed = collapsed_of(beginning(fit, prepared), fit.scaling, prepared)
     else:
         observed = prior_process(fit, prepared, unknown_start=True).observed(fit.system.noise_sd)
-    y = prepared.tensors().outputs
-    y = y if fit.model.several_outputs else y[:, 0]
-    each = pointwise_log_density(observed, y, "forecast")
+    each = pointwise_log_density(observed, prepared.tensors().observations, "forecast")
     return logsumexp(each, axis=0) - np.log(len(each))
 
 

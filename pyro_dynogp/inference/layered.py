@@ -32,7 +32,6 @@ from pyro_dynogp.layers.noise import Gaussian
 from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.models.assembly import assemble
 from pyro_dynogp.models.cascade import Cascade
-from pyro_dynogp.models.collapsed import outputs_with_gaps
 from pyro_dynogp.models.layers import Dynamic
 from pyro_dynogp.models.systems import scaled_inputs
 from pyro_dynogp.parallel import child_seeds, parallel_map, seeded
@@ -253,8 +252,6 @@ def fit_layered(
     if isinstance(guide, str | Mapping):
         layer_guide(target, guide, {}, 2)  # refuse an unknown name before any work
     argument = records[0] if len(records) == 1 else tuple(records)
-    for record in records:
-        outputs_with_gaps(record)
     points: list[Values] = [{}] * restarts
     if not own:
         found = starting_points(

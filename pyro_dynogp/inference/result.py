@@ -24,7 +24,7 @@ from pyro_dynogp.inference.guides import (
 )
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.models.cascade import Cascade
-from pyro_dynogp.models.collapsed import collapsed_of, outputs_with_gaps
+from pyro_dynogp.models.collapsed import collapsed_of
 from pyro_dynogp.models.linear import LinearDynamicGP
 from pyro_dynogp.prediction import cascade as _cascade
 from pyro_dynogp.prediction import linear as _linear
@@ -200,13 +200,12 @@ class Fit:
             if isinstance(self.model, Cascade):
                 for record in checked:
                     system = beginning(self, record)
-                    y = outputs_with_gaps(record)
+                    y = record.tensors().observations
                     total = total + collapsed_of(system, self.scaling, record).log_prob(y)
                 return total.numpy()
             for record in checked:
                 process = _linear.prior_process(self, record)
-                y = record.tensors().outputs
-                y = y if self.model.several_outputs else y[:, 0]
+                y = record.tensors().observations
                 total = total + process.observed(self.system.noise_sd).log_prob(y)
         return total.numpy()
 

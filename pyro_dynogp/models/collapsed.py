@@ -122,15 +122,9 @@ def collapsed_of(
     )
 
 
-def outputs_with_gaps(record: Record) -> Tensor:
-    """Outputs (n,) or (n, n_y), NaN where missing."""
-    y = record.tensors().outputs
-    return y if record.n_outputs > 1 else y[:, 0]
-
-
 def observe_collapsed(
     system: CascadeSystem, scaling: Scaling, record: Record, suffix: str, inputs: Tensor
 ) -> None:
     """Observe (or sample) the outputs of one record, of scaled inputs (*b, n, n_u)."""
-    y = outputs_with_gaps(record) if record.n_outputs else None
+    y = record.tensors().observations if record.n_outputs else None
     pyro.sample(f"y{suffix}", collapsed_of(system, scaling, record, inputs), obs=y)

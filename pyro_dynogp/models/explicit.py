@@ -79,8 +79,7 @@ def outputs_of(record: Record) -> tuple[Tensor | None, Tensor | None]:
     """Outputs (n,) or (n, n_y) with zeros where missing, and where that is; None for none."""
     if not record.n_outputs:
         return None, None
-    y = record.tensors().outputs
-    y = y if record.n_outputs > 1 else y[:, 0]
+    y = record.tensors().observations
     missing = torch.isnan(y)
     return (y.masked_fill(missing, 0.0), missing) if bool(missing.any()) else (y, None)
 
@@ -99,7 +98,5 @@ def observe_linear(
         level, sd = level.squeeze(-1), sd.squeeze(-1)
     driven = process.inputs if modes.inputs else None
     physical = LTIProcess(modes, process.grid, driven, process.initial_state, offset=level)
-    y = record.tensors().outputs if record.n_outputs else None
-    if y is not None and not several:
-        y = y[:, 0]
+    y = record.tensors().observations if record.n_outputs else None
     pyro.sample(f"y{suffix}", physical.observed(sd), obs=y)

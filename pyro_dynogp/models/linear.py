@@ -238,14 +238,8 @@ class LinearDynamicGP:
                 state = initial_mean(system.past_inputs, states["initial_state"])
             u = None if inputs is None else inputs[index]
             process = self.process(system, record, scaling, state, inputs=u)
-            outputs = record.tensors().outputs
-            if not self.several_outputs and record.n_outputs:
-                outputs = outputs[:, 0]
-            pyro.sample(
-                f"y{suffix}",
-                process.observed(system.noise_sd),
-                obs=outputs if record.n_outputs else None,
-            )
+            y = record.tensors().observations if record.n_outputs else None
+            pyro.sample(f"y{suffix}", process.observed(system.noise_sd), obs=y)
 
 
 def prepare(model: Any, records: Record | Sequence[Record]) -> tuple[Record, ...]:

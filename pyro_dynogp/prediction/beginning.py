@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from pyro_dynogp.models.cascade import Cascade
-from pyro_dynogp.models.collapsed import collapsed_of, outputs_with_gaps
+from pyro_dynogp.models.collapsed import collapsed_of
 from pyro_dynogp.models.layers import Dynamic
 from pyro_dynogp.models.systems import CascadeSystem
 from pyro_dynogp.record import Record
@@ -52,7 +52,7 @@ def estimate(fit: Fit, record: Record) -> dict[str, Tensor]:
     model = cascade_of(fit)
     head = record[: min(SAMPLES, len(record))]
     system = fit._system_at(fit.mode)
-    y = outputs_with_gaps(head)
+    y = head.tensors().observations
     sizes = {}
     for one in model.state_sites:
         assert isinstance(one.layer, Dynamic)

@@ -99,8 +99,7 @@ def forecast(
     with torch.no_grad():
         system, model, scaling = fit.system, _model(fit), fit.scaling
         before = prior_process(fit, past, unknown_start=True)
-        y = past.tensors().outputs
-        y = y if model.several_outputs else y[:, 0]
+        y = past.tensors().observations
         noise = system.noise_sd
         end = before.condition(y.expand(before.batch_shape + y.shape), noise).final_state
         held = None
@@ -120,8 +119,7 @@ def predict(fit: Fit, record: Record, horizon: int, samples: int, seed: int) -> 
     with torch.no_grad():
         process = prior_process(fit, record, unknown_start=True)
         observed = process.observed(fit.system.noise_sd)
-        y = record.tensors().outputs
-        y = y if fit.model.several_outputs else y[:, 0]
+        y = record.tensors().observations
         residual, missing = split_missing(observed.rows(y - process.mean))
         v = observed.noise_rows
         v = v if missing is None else v.masked_fill(missing, torch.inf)

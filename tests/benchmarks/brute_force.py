@@ -26,7 +26,6 @@ from pyro_dynogp.inference.posterior import posterior_of
 from pyro_dynogp.inference.refit import optima_of, refit
 from pyro_dynogp.models.assembly import assemble
 from pyro_dynogp.models.cascade import Cascade
-from pyro_dynogp.models.collapsed import outputs_with_gaps
 from pyro_dynogp.moments import filtering, smoothing
 from pyro_dynogp.moments.problem import each
 from tests.conftest import simulate_record
@@ -139,7 +138,7 @@ def conditional(fit: Any, record: dgp.Record) -> np.ndarray:
     """
     values = draws_of(fit, count=2000, seed=3).values
     some = with_draws(fit, values)
-    y = outputs_with_gaps(record)
+    y = record.tensors().observations
     observed = observed_of(some, record, 0)
     with pyro.validation_enabled(False), torch.no_grad():
         if isinstance(fit.model, Cascade):
