@@ -173,11 +173,3 @@ class Noise:
         if missing is not None:
             one = one.mask(~missing)
         return one
-
-    @property
-    def variance_factor(self) -> float:
-        """Variance over squared scale; infinite for a Student-t of two degrees or fewer."""
-        nu = self.likelihood.degrees_of_freedom
-        if nu is None:
-            return 1.0
-        return nu / (nu - 2.0) if nu > 2 else math.inf
