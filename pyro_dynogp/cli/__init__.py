@@ -12,7 +12,7 @@ import click
 
 from pyro_dynogp.cli.close_loop import close_loop
 from pyro_dynogp.cli.data import InvalidInput, record_for, training_and_test
-from pyro_dynogp.cli.options import CLOCK
+from pyro_dynogp.cli.options import CHANNELS, CLOCK, PAIRS, WORK, seed
 
 
 class _Group(click.Group):
@@ -110,25 +110,11 @@ def info(subject: str | None) -> None:
 
 @main.command()
 @click.argument("data")
-@click.option("--input", "inputs", multiple=True, metavar="NAME", help="Input column; repeatable.")
-@click.option(
-    "--output", "outputs", multiple=True, metavar="NAME", help="Output column; repeatable."
-)
-@CLOCK
-@click.option(
-    "--unit",
-    "units",
-    multiple=True,
-    metavar="NAME=UNIT",
-    help="Unit of a column, for labels and checks; repeatable.",
-)
+@CHANNELS
 @click.option(
     "--train", type=click.IntRange(min=2), metavar="N", help="Train on the first N samples alone."
 )
-@click.option(
-    "--pairs", type=click.IntRange(min=1), default=5, show_default=True,
-    help="Number of pole pairs (half the order).",
-)  # fmt: skip
+@PAIRS
 @click.option(
     "--method", type=click.Choice(["map", "svi", "nuts"]), default="map", show_default=True,
     help="Posterior mode; variational posterior; Hamiltonian Monte Carlo.",
@@ -138,10 +124,7 @@ def info(subject: str | None) -> None:
     help="Number of points from which the optimum is sought.",
 )  # fmt: skip
 @click.option("--steps", type=click.IntRange(min=1), metavar="N", help="Most iterations.")
-@click.option(
-    "--seed", type=click.IntRange(min=0), default=0, show_default=True,
-    help="The same seed gives the same fit.",
-)  # fmt: skip
+@seed("fit")
 @click.option(
     "--save", type=click.Path(dir_okay=False, path_type=Path), metavar="FILE",
     help="Write the fit here (.safetensors).",
@@ -150,13 +133,7 @@ def info(subject: str | None) -> None:
     "--figures", type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
     help="Write figures into this folder; made where it is missing.",
 )  # fmt: skip
-@click.option(
-    "--workers",
-    type=click.IntRange(min=1),
-    metavar="N",
-    help="Processes; all processors if not given.",
-)
-@click.option("--quiet", is_flag=True, help="No progress bars.")
+@WORK
 def fit(
     data: str,
     inputs: tuple[str, ...],

@@ -8,20 +8,12 @@ from typing import Any
 import click
 
 from pyro_dynogp.cli.data import InvalidInput, whole_record
-from pyro_dynogp.cli.options import CLOCK
+from pyro_dynogp.cli.options import CHANNELS, PAIRS, WORK, seed
 
 
 @click.command(name="close-loop")
 @click.argument("data")
-@click.option("--input", "inputs", multiple=True, metavar="NAME", help="Input column; repeatable.")
-@click.option(
-    "--output", "outputs", multiple=True, metavar="NAME", help="Output column; repeatable."
-)
-@CLOCK
-@click.option(
-    "--unit", "units", multiple=True, metavar="NAME=UNIT",
-    help="Unit of a column, for labels and checks; repeatable.",
-)  # fmt: skip
+@CHANNELS
 @click.option(
     "--candidates", multiple=True, metavar="NAME",
     help="Column that may act on the output although the model does not use it; repeatable. "
@@ -31,10 +23,7 @@ from pyro_dynogp.cli.options import CLOCK
     "--model", "kind", type=click.Choice(["linear", "wiener"]), default="linear",
     show_default=True, help="Linear dynamics; or linear dynamics, then a static function.",
 )  # fmt: skip
-@click.option(
-    "--pairs", type=click.IntRange(min=1), default=5, show_default=True,
-    help="Number of pole pairs (half the order).",
-)  # fmt: skip
+@PAIRS
 @click.option(
     "--restarts", type=click.IntRange(min=1), metavar="N",
     help="Number of points from which the optimum of the first fit is sought.",
@@ -43,20 +32,13 @@ from pyro_dynogp.cli.options import CLOCK
     "--max-rounds", type=click.IntRange(min=1), default=4, show_default=True,
     help="Most effects that are added, one in each round.",
 )  # fmt: skip
-@click.option(
-    "--seed", type=click.IntRange(min=0), default=0, show_default=True,
-    help="The same seed gives the same report.",
-)  # fmt: skip
+@seed("report")
 @click.option(
     "--out", type=click.Path(file_okay=False, path_type=Path), default=Path("close_loop_output"),
     show_default=True, metavar="FOLDER",
     help="Folder for the report and the extended model; made where it is missing.",
 )  # fmt: skip
-@click.option(
-    "--workers", type=click.IntRange(min=1), metavar="N",
-    help="Processes; all processors if not given.",
-)  # fmt: skip
-@click.option("--quiet", is_flag=True, help="No progress bars.")
+@WORK
 def close_loop(
     data: str,
     inputs: tuple[str, ...],
