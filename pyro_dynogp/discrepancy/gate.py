@@ -13,7 +13,7 @@ from pyro_dynogp.discrepancy.paths import looked_at, own
 from pyro_dynogp.discrepancy.responses import responses, standardised
 from pyro_dynogp.discrepancy.scan import tail_probability
 from pyro_dynogp.discrepancy.serial_effects import held_out_innovations, portmanteau
-from pyro_dynogp.discrepancy.sieve import columns_score, replicates, sieve, spanning
+from pyro_dynogp.discrepancy.sieve import Sieve, columns_score, replicates, sieve, spanning
 from pyro_dynogp.signals import held, hermite
 
 # Of 50 replicates each.
@@ -58,7 +58,7 @@ def structure_left(
         "one-step errors are not normal": _not_normal(v[np.isfinite(v)], seed),
         "the residual follows inputs, other channels or time": _follows(r, seed),
         "the residual follows products of inputs at two times, or a response that changes": (
-            _interacts(plain or r, seed)
+            beyond_catalogue(plain or r, seed)[0]
         ),
     }
     smallest = min(ways.values())
@@ -102,13 +102,27 @@ def _follows(r: Residuals, seed: int) -> float:
             blocks.append(responses(hermite(u), r.step, r.time, constants=constants))
     for signal in r.candidates.values():
         blocks.append(responses(held(signal), r.step, r.time, constants=constants))
-    return _explained(r, blocks, seed)
+    return _explained(r, blocks, seed).p_value
 
 
-def _interacts(r: Residuals, seed: int) -> float:
-    """Probability of as much that products of inputs, or changing responses, explain."""
-    blocks = interactions(r)
-    return _explained(r, blocks, seed) if blocks else 1.0
+def beyond_catalogue(residuals: Residuals, seed: int = 0) -> tuple[float, float]:
+    """Test for what no effect of the catalogue does, see `interactions`.
+
+    Args:
+        residuals: of one output (n,). seed: of the simulated null.
+
+    Returns:
+        Probability of as much that products of inputs at two times, or responses that change,
+        explain where there are none; and gain in log-likelihood of the best of them [nats].
+
+    Raises:
+        ValueError: where fewer than 30 held-out samples are measured.
+    """
+    blocks = interactions(residuals)
+    if not blocks:
+        return 1.0, 0.0
+    found = _explained(residuals, blocks, seed)
+    return found.p_value, found.gain
 
 
 def _slow(r: Residuals) -> np.ndarray:
@@ -117,13 +131,13 @@ def _slow(r: Residuals) -> np.ndarray:
     return np.cos(np.pi * t[:, None] * np.arange(1, 5))
 
 
-def _explained(r: Residuals, blocks: Sequence[np.ndarray], seed: int) -> float:
-    """Probability of as much that one of several blocks of columns explains."""
+def _explained(r: Residuals, blocks: Sequence[np.ndarray], seed: int) -> Sieve:
+    """Test whether one of several blocks of columns explains a residual."""
     x = np.where(r.held_out, r.residual, np.nan)
     ends = np.cumsum([b.shape[1] for b in blocks])
     variants = [np.arange(e - b.shape[1], e) for b, e in zip(blocks, ends, strict=True)]
     columns = standardised(np.column_stack(blocks))
-    found = sieve(
+    return sieve(
         x,
         columns_score(columns, variants, spanning(columns[:, :0]), ~np.isfinite(x)),
         np.array([len(v) for v in variants]),
@@ -132,4 +146,3 @@ def _explained(r: Residuals, blocks: Sequence[np.ndarray], seed: int) -> float:
         replicates=replicates(len(r), columns.shape[1]),
         seed=seed,
     )
-    return found.p_value

@@ -23,6 +23,7 @@ from pyro_dynogp.discrepancy.reporting import report_of
 from pyro_dynogp.discrepancy.rounds import Rounds, Stopwatch
 from pyro_dynogp.discrepancy.search import Found, candidates_of
 from pyro_dynogp.discrepancy.trials import without
+from pyro_dynogp.discrepancy.words import OUTSIDE
 from pyro_dynogp.inference.fit import fit as fit_model
 from pyro_dynogp.inference.result import Method
 from pyro_dynogp.models.cascade import Cascade
@@ -60,8 +61,10 @@ def close_loop(
     block standard errors and 4 nats (or, as outliers make both large, with no sample counted for
     more than 10 nats), effects between inputs and output before those of the noise, which their
     lack imitates. Of effects that explain as much the one that leaves least open is kept, and
-    the others are reported as ties. Rounds end where nothing is left, or nothing helps. An effect
-    that no block mends (feedback) is among the report's effects, after those that were added.
+    the others are reported as ties, and so is a cause that the catalogue lacks, where products of
+    inputs or responses that change with time explain far more. Rounds end where nothing is left, or
+    nothing helps. An effect that no block mends (feedback) is among the report's effects, after
+    those that were added.
 
     Args:
         fit: a fit to one record.
@@ -115,11 +118,15 @@ def close_loop(
         confirmed = rounds.confirm(chosen, current, number)
         watch.stop("refits")
         attempts += confirmed.attempts
-        if confirmed.winner is None or confirmed.model is None:
+        winner, larger = confirmed.winner, confirmed.model
+        if winner is None or larger is None:
             break
-        accepted.append((confirmed.winner, confirmed))
-        model = confirmed.model
-        again = rounds.hold_out_less(confirmed.winner)
+        if rounds.doubtful(looked, winner):
+            confirmed = replace(confirmed, ties=(*confirmed.ties, OUTSIDE))
+        watch.stop("residual tests")
+        accepted.append((winner, confirmed))
+        model = larger
+        again = rounds.hold_out_less(winner)
         if confirmed.fit is not None and not again:
             current = confirmed.fit
         else:

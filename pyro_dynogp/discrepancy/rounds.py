@@ -18,7 +18,7 @@ from pyro_dynogp.discrepancy.extend import (
     used_channels,
     without_process_noise,
 )
-from pyro_dynogp.discrepancy.gate import structure_left
+from pyro_dynogp.discrepancy.gate import beyond_catalogue, structure_left
 from pyro_dynogp.discrepancy.refits import quick_fit
 from pyro_dynogp.discrepancy.residuals import residuals_of
 from pyro_dynogp.discrepancy.search import Found, look, merged
@@ -30,6 +30,10 @@ if TYPE_CHECKING:
 
 # Families of effects that go with inputs.
 OF_INPUTS = ("paths", "shapes")
+# What no effect of the catalogue does explains certainly more of a residual than an effect that is
+# added where it gains so many times as much. (Where an effect is what was missing it gains at most
+# as much, as products of an input with its own past resemble its square.)
+FAR = 2.0
 
 
 class Stopwatch:
@@ -151,6 +155,13 @@ class Rounds:
             chosen, current, self.data.known, self.held_out, number=number,
             seed=self.seed, level=self.level, workers=self.workers, progress=self.progress,
         )  # fmt: skip
+
+    def doubtful(self, looked: Looked, winner: Found) -> bool:
+        """Whether what no effect of the catalogue does explains far more than the winner."""
+        tests = [beyond_catalogue(one, seed=self.seed) for one in looked.residuals]
+        return any(
+            p * len(tests) <= self.gate and gain > FAR * winner.evidence.gain for p, gain in tests
+        )
 
     def hold_out_less(self, winner: Found) -> bool:
         """Give parts of B to the fit where an effect begins there; whether that was needed."""

@@ -8,6 +8,8 @@ from pyro_dynogp.channels import Channel
 from pyro_dynogp.discrepancy.extend import Model, as_cascade
 from pyro_dynogp.models.layers import Dynamic
 
+# In a tie, what products of inputs at two times, or responses that change with time, speak for.
+OUTSIDE = "a cause outside the catalogue"
 # Which experiment tells two effects apart.
 EXPERIMENTS: dict[frozenset[str], str] = {
     frozenset({"dead time", "unmodelled dynamics"}): (
@@ -35,6 +37,11 @@ EXPERIMENTS: dict[frozenset[str], str] = {
 
 def experiment(first: str, others: tuple[str, ...]) -> str:
     """Which experiment tells an effect from others; "" for no others."""
+    if OUTSIDE in others:
+        return (
+            "the same input twice, at another time and at half the size: what is constant responds "
+            "alike, what is linear half as much"
+        )
     known = [EXPERIMENTS[pair] for o in others if (pair := frozenset({first, o})) in EXPERIMENTS]
     if known:
         return "; ".join(dict.fromkeys(known))

@@ -65,3 +65,18 @@ def test_what_is_left_is_said():
     assert "level shift (0.02)" in rounds.left(Looked([quiet], [quiet], found, []))[0]
     (said,) = rounds.left(Looked([quiet], [product], [], []))
     assert "products of inputs" in said
+
+
+def test_a_small_winner_beside_a_cause_outside_the_catalogue_is_doubtful():
+    record = oscillator(0, 0.0, seed=2)
+    fit = dgp.fit(MODEL, record[:240], restarts=1, workers=1, progress=False)
+    rounds = Rounds(blocks_of(fit, record, None), [], 0, 0.05, 8, (), 1, False)
+    product = residuals(3, 400, effect=lambda t, mean, u: share(u[:, 0] * np.roll(u[:, 0], 6), 0.3))
+    small, large = (
+        Found(effects.LevelShift(), Evidence("level shift", 5.0, 1e-6, gain, 0.1), 1e-5)
+        for gain in (8.0, 300.0)
+    )
+    assert rounds.doubtful(Looked([product], [product], [], []), small)
+    assert not rounds.doubtful(Looked([product], [product], [], []), large)
+    quiet = residuals(3, 400)
+    assert not rounds.doubtful(Looked([quiet], [quiet], [], []), small)
