@@ -16,7 +16,7 @@ import itertools
 import numpy as np
 
 from pyro_dynogp.discrepancy.evidence import Residuals
-from pyro_dynogp.discrepancy.paths import Paths, looked_at, paths
+from pyro_dynogp.discrepancy.paths import looked_at, paths
 from pyro_dynogp.discrepancy.responses import filtered, standardised
 from pyro_dynogp.signals import delayed
 
@@ -40,12 +40,20 @@ def interactions(residuals: Residuals) -> list[np.ndarray]:
         mean's own correlation time, and in the place of each of the (most effective) inputs.
     """
     r = residuals
-    path = paths(r)
-    leading = np.argsort(-path.shares.std(axis=0), kind="stable")[:INPUTS]
+    path = paths(r) if r.inputs.shape[1] else None
+    shares = np.zeros(0) if path is None else path.shares.std(axis=0)
+    leading = np.argsort(-shares, kind="stable")[:INPUTS]
     inputs = [u for u in standardised(r.inputs[:, np.sort(leading)]).T if u.any()]
     lag = _correlation_time(r.mean) * r.step
-    signals = _products(inputs, r) + _changing([*inputs, *standardised(r.mean[:, None]).T], r)
-    return [_block(signal, path, leading[:2], lag) for signal in signals]
+
+    def block(signal: np.ndarray) -> np.ndarray:
+        one = signal[:, None]
+        slow = filtered(one, r.step, r.time, np.array([-1.0 / lag]), lags=0)[:, 0]
+        ways = [] if path is None else [path(int(j), one) for j in leading[:2]]
+        return standardised(np.column_stack([slow, *ways]))
+
+    moving = [*inputs, *standardised(r.mean[:, None]).T]
+    return [block(signal) for signal in _products(inputs, r) + _changing(moving, r)]
 
 
 def _products(inputs: list[np.ndarray], r: Residuals) -> list[np.ndarray]:
@@ -64,12 +72,6 @@ def _changing(signals: list[np.ndarray], r: Residuals) -> list[np.ndarray]:
     waves = [np.cos(2.0 * np.pi * k * s) for k in COSINES]
     waves += [np.sin(2.0 * np.pi * k * s) for k in SINES]
     return [signal * wave for signal in signals if signal.any() for wave in waves]
-
-
-def _block(signal: np.ndarray, path: Paths, inputs: np.ndarray, lag: float) -> np.ndarray:
-    one = signal[:, None]
-    slow = filtered(one, path.step, path.time, np.array([-1.0 / lag]), lags=0)[:, 0]
-    return standardised(np.column_stack([slow, *(path(int(j), one)[:, 0] for j in inputs)]))
 
 
 def _correlation_time(mean: np.ndarray) -> int:

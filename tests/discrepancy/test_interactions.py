@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from pyro_dynogp.discrepancy.gate import beyond_catalogue
 from pyro_dynogp.discrepancy.interactions import COSINES, DELAYS, INPUTS, SINES, interactions
 
 from .series import in_other_units, residuals, share
@@ -60,3 +61,14 @@ def test_units_do_not_matter():
     assert len(a) == len(b)
     for block in a:
         assert any(all(spans(other, x) for x in block.T) for other in b)
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_without_inputs_only_a_mean_that_moves_may_change(moves):
+    """A model whose inputs act at once (a calendar) has a mean, but no input with dynamics."""
+    r = residuals(5, 300)
+    mean = r.mean if moves else np.full(300, 2.0)
+    r = dataclasses.replace(r, inputs=np.zeros((300, 0)), input_names=(), mean=mean)
+    blocks = interactions(r)
+    assert len(blocks) == (len(COSINES) + len(SINES) if moves else 0)
+    assert beyond_catalogue(r)[0] > 0.05
