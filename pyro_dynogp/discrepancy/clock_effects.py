@@ -10,6 +10,7 @@ import numpy as np
 from pyro_dynogp._errors import invalid
 from pyro_dynogp.discrepancy.clocks import all_zones, clock_shares, in_zone
 from pyro_dynogp.discrepancy.evidence import Evidence, Residuals
+from pyro_dynogp.discrepancy.paths import check_inputs
 from pyro_dynogp.discrepancy.sieve import (
     Prepare,
     Score,
@@ -92,8 +93,7 @@ def clock_shift(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 
     (1993), in the whitened residual; the null by `sieve`.
     """
     r = residuals
-    if not r.input_names:
-        raise invalid("residuals", expected="an input that acts on the mean", got="no inputs")
+    check_inputs(r)
     names, shares = clock_shares(r, zones, CHANNELS)
     if not names:
         raise invalid("residuals", expected="an input that acts on the mean", got="none")

@@ -63,7 +63,8 @@ def with_process_noise(model: Model) -> Model:
 def without_process_noise(model: Model) -> Model:
     """The model with deterministic dynamics, but where process noise is all that drives them."""
     if isinstance(model, LinearDynamicGP):
-        return replace(model, process_noise=False)
+        driven = model.inputs > model.direct
+        return replace(model, process_noise=False) if driven else model
     return deterministic(model)
 
 

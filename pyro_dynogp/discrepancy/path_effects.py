@@ -18,7 +18,7 @@ from pyro_dynogp.discrepancy.looking import (
     unit,
 )
 from pyro_dynogp.discrepancy.own_past import with_past
-from pyro_dynogp.discrepancy.paths import looked_at, own, paths
+from pyro_dynogp.discrepancy.paths import check_inputs, looked_at, own, paths
 from pyro_dynogp.discrepancy.responses import filtered, responses, standardised, time_constants
 from pyro_dynogp.signals import delayed, held, shifted
 
@@ -160,6 +160,7 @@ def unmodelled_dynamics(residuals: Residuals, *, seed: int = 0) -> Evidence:
     Raises:
         ValueError: where fewer than 30 samples are held out and measured.
     """
+    check_inputs(residuals)
     r = regained(residuals)
     n_u = r.inputs.shape[1]
     banks = [responses(r.inputs[:, [j]], r.step, r.time) for j in range(n_u)]

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pyro_dynogp._errors import invalid
 from pyro_dynogp.discrepancy.evidence import Residuals
 from pyro_dynogp.discrepancy.own_past import with_past
 from pyro_dynogp.discrepancy.responses import filtered, responses, standardised, time_constants
@@ -42,15 +43,29 @@ class Paths:
         return columns @ self.weights[j]
 
 
+def check_inputs(residuals: Residuals) -> None:
+    """Whether the model has an input with dynamics.
+
+    Raises:
+        ValueError: where it has none.
+    """
+    if not residuals.inputs.shape[1]:
+        raise invalid("residuals", expected="an input that acts on the mean", got="no inputs")
+
+
 def paths(residuals: Residuals) -> Paths:
     """Least squares of the mean on filters of the inputs; the mean has no noise.
 
     The filters' rates are time constants on a grid and the poles of a difference equation fitted
     to mean and inputs, which are those of the model where it is linear.
+
+    Raises:
+        ValueError: where the model has no input with dynamics.
     """
+    check_inputs(residuals)
     r = residuals
     n, n_u = r.inputs.shape
-    budget = min(COLUMNS, n // 4) // max(n_u, 1)
+    budget = min(COLUMNS, n // 4) // n_u
     constants, lags = int(np.clip(budget - 4, 2, 8)), 2 if budget > 8 else 0
     rates = (-1.0 / time_constants(r.step, r.time, constants)).astype(complex)
     if budget >= constants + 3 + ORDER:

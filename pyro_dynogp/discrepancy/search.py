@@ -64,10 +64,12 @@ def look(
     looked = parallel_map(
         _look, tasks, workers=workers, progress=progress, description="residual tests"
     )
+    reasons: dict[str, list[str]] = {}
+    for task, why in zip(tasks, looked, strict=True):
+        if isinstance(why, str):
+            reasons.setdefault(why, []).append(task.effect.name)
     skipped = [
-        f"Not tested for {task.effect.name}: {why}"
-        for task, why in zip(tasks, looked, strict=True)
-        if isinstance(why, str)
+        f"Not tested for {', '.join(dict.fromkeys(names))}: {why}" for why, names in reasons.items()
     ]
     found = [
         (task.effect, replace(one, p_value=min(1.0, one.p_value * len(residuals))))

@@ -145,3 +145,22 @@ def test_an_effect_of_ones_own_is_looked_for() -> None:
     report = close(fitted(bent), bent, effects=(SquaredInput(),), max_rounds=2)
     assert [one.name for one in report.effects] == ["squared input"]
     assert report.after["rmse"] < 0.6 * report.before["rmse"]
+
+
+def test_a_record_without_inputs() -> None:
+    """Process noise is all that drives the model; what goes with inputs cannot be tested."""
+    rng = np.random.default_rng(0)
+    y = lfilter([1.0], [1.0, -1.6, 0.8], rng.standard_normal(N))
+    y = y / y.std() + 0.05 * rng.standard_normal(N)
+    y[270:] += 4.0
+    record = dgp.Record(0.1 * np.arange(N), outputs=y)
+    model = dgp.LinearDynamicGP(inputs=0, pairs=1)
+    fit = dgp.fit(model, record[:240], restarts=2, workers=1, progress=False)
+    looked_for = (effects.LevelShift(), effects.DeadTime(), effects.UnmodelledDynamics())
+    report = close(fit, record, effects=looked_for)
+    (found,) = report.effects
+    assert found.name == "level shift"
+    assert report.after["rmse"] < 0.7 * report.before["rmse"]
+    (why,) = report.warnings
+    assert why.startswith("Not tested for dead time, unmodelled dynamics: ")
+    assert "no inputs" in why
