@@ -58,7 +58,7 @@ def structure_left(
         "one-step errors are not normal": _not_normal(v[np.isfinite(v)], seed),
         "the residual follows inputs, other channels or time": _follows(r, seed),
         "the residual follows products of inputs at two times, or a response that changes": (
-            beyond_catalogue(plain or r, seed)[0]
+            beyond_catalogue(r if plain is None else plain, seed)[0]
         ),
     }
     smallest = min(ways.values())

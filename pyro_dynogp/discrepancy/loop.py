@@ -105,7 +105,6 @@ def close_loop(
     for number in range(1, max_rounds + 1):
         known = {one.effect.name for one, _ in accepted}
         looked = rounds.look(current, known)
-        watch.stop("residual tests")
         if number == 1:
             warnings += [*_faults(looked.residuals, data.known), *looked.notes]
         reported = _reported(looked.found, rounds.gate)

@@ -178,7 +178,10 @@ class Rounds:
 
         By the tests of single effects, all paid for, or else by the omnibus test.
         """
-        named = {f.effect.name: f.q_value for f in looked.found if f.q_value <= self.gate}
+        named: dict[str, float] = {}
+        for one in looked.found:  # an effect has several pieces of evidence, the best one first
+            if one.q_value <= self.gate:
+                named.setdefault(one.effect.name, one.q_value)
         if named:
             rates = ", ".join(f"{name} ({q:.2g})" for name, q in named.items())
             return (f"Residual tests speak for (false discovery rate): {rates}.",)

@@ -37,12 +37,12 @@ EXPERIMENTS: dict[frozenset[str], str] = {
 
 def experiment(first: str, others: tuple[str, ...]) -> str:
     """Which experiment tells an effect from others; "" for no others."""
+    known = [EXPERIMENTS[pair] for o in others if (pair := frozenset({first, o})) in EXPERIMENTS]
     if OUTSIDE in others:
-        return (
+        known.append(
             "the same input twice, at another time and at half the size: what is constant responds "
             "alike, what is linear half as much"
         )
-    known = [EXPERIMENTS[pair] for o in others if (pair := frozenset({first, o})) in EXPERIMENTS]
     if known:
         return "; ".join(dict.fromkeys(known))
     return "a record with inputs for which their predictions differ" if others else ""

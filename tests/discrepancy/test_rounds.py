@@ -63,6 +63,8 @@ def test_what_is_left_is_said():
     assert rounds.left(Looked([quiet], [quiet], [], [])) == ()
     assert rounds.left(Looked([quiet], [quiet], found[:1], [])) == ()  # half of the level is 0.025
     assert "level shift (0.02)" in rounds.left(Looked([quiet], [quiet], found, []))[0]
+    better = Found(effects.LevelShift(), Evidence("level shift", 1.0, 1e-3, 3.0, 0.1), 4e-3)
+    assert "level shift (0.004)" in rounds.left(Looked([quiet], [quiet], [better, *found], []))[0]
     (said,) = rounds.left(Looked([quiet], [product], [], []))
     assert "products of inputs" in said
 
