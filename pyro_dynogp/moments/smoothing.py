@@ -18,7 +18,7 @@ from pyro_dynogp.moments.filtering import SEGMENT, enter, inner, measure, output
 from pyro_dynogp.moments.layout import FLOOR, workspace
 from pyro_dynogp.moments.measured_function import function_moments, function_terms
 from pyro_dynogp.moments.noise import noise_terms
-from pyro_dynogp.moments.state import covary, dot, update
+from pyro_dynogp.moments.state import covary, dot, step_back, update
 from pyro_dynogp.moments.static_layer import append
 
 
@@ -210,9 +210,7 @@ def _backwards(layout, values, rows, means, covariances, cavity):
     n_y = values.y.shape[1]
     N = values.m0.shape[0]
     A = values.G.shape[1]
-    E = A - N
     S = layout.channels.shape[0]
-    pairs = N // 2
     mean = np.empty((n, A))
     variance = np.empty((n, rows.shape[0]))
     m = np.zeros(A)
@@ -254,42 +252,7 @@ def _backwards(layout, values, rows, means, covariances, cavity):
                 update(P, m, C[o], alphas[o], betas[o])
             if time < n - 1 and layout.step[time + 1] >= 0:
                 k = layout.step[time + 1]
-                re = values.re[k]
-                im = values.im[k]
-                gamma = values.gamma[k]
-                # lambda <- F' lambda, Lambda <- F' Lambda F with F = [Phi gamma].
-                for f in range(E):
-                    total = 0.0
-                    for j in range(N):
-                        total += gamma[j, f] * bar[j]
-                    bar[N + f] = total
-                for i in range(N):
-                    for j in range(pairs):
-                        x = L[i, j]
-                        w = L[i, pairs + j]
-                        moved[i, j] = re[j] * x + im[j] * w
-                        moved[i, pairs + j] = re[j] * w - im[j] * x
-                    for f in range(E):
-                        total = 0.0
-                        for j in range(N):
-                            total += L[i, j] * gamma[j, f]
-                        moved[i, N + f] = total
-                for i in range(A):
-                    for f in range(E):
-                        total = 0.0
-                        for j in range(N):
-                            total += gamma[j, f] * moved[j, i]
-                        L[N + f, i] = total
-                    for j in range(pairs):
-                        x = moved[j, i]
-                        w = moved[pairs + j, i]
-                        L[j, i] = re[j] * x + im[j] * w
-                        L[pairs + j, i] = re[j] * w - im[j] * x
-                for j in range(pairs):
-                    x = bar[j]
-                    w = bar[pairs + j]
-                    bar[j] = re[j] * x + im[j] * w
-                    bar[pairs + j] = re[j] * w - im[j] * x
+                step_back(values.re[k], values.im[k], values.gamma[k], bar, L, moved)
             covary(P, bar, c)
             for j in range(A):
                 mean[time, j] = m[j] + c[j]

@@ -45,14 +45,12 @@ def update(P, m, c, alpha, beta):
 
 
 @njit(**BORROWING)
-def move(re, im, gamma, Q, m, P, T):
-    """State mean and covariance one step on, in place in the first N entries of m and P.
+def step_covariance(re, im, gamma, P, T):
+    """Write F P to T (N, A): covariance of the state one step on with the joint Gaussian before.
 
-    T (N, A) is scratch: on return T = F P with F = [Phi gamma], for the old P.
+    F = [Phi gamma] takes [x; f] to the next state.
     """
-    N = gamma.shape[0]
-    A = m.shape[0]
-    E = A - N
+    N, A = T.shape
     pairs = N // 2
     for j in range(pairs):
         a = re[j]
@@ -61,53 +59,23 @@ def move(re, im, gamma, Q, m, P, T):
         for i in range(A):
             T[j, i] = a * P[j, i] - b * P[k, i]
             T[k, i] = b * P[j, i] + a * P[k, i]
-        x = m[j]
-        m[j] = a * x - b * m[k]
-        m[k] = b * x + a * m[k]
     for j in range(N):
-        for f in range(E):
+        for f in range(A - N):
             t = gamma[j, f]
             if t != 0.0:
-                m[j] += t * m[N + f]
                 for i in range(A):
                     T[j, i] += t * P[N + f, i]
-    for i in range(N):
-        for j in range(pairs):
-            k = pairs + j
-            x = T[i, j]
-            w = T[i, k]
-            P[i, j] = re[j] * x - im[j] * w + Q[i, j]
-            P[i, k] = im[j] * x + re[j] * w + Q[i, k]
-        for j in range(N):
-            for f in range(E):
-                P[i, j] += T[i, N + f] * gamma[j, f]
 
 
 @njit(**BORROWING)
-def move_adjoint(k, layout, values, bars, m, P, m_bar, P_bar, T, T_bar):
-    """Reverse of `move` over step k: m, P are those before it; the bars change in place."""
-    re = values.re[k]
-    im = values.im[k]
-    gamma = values.gamma[k]
-    N = gamma.shape[0]
-    A = m.shape[0]
+def step_back(re, im, gamma, m_bar, P_bar, T_bar):
+    """M_bar <- F' m_bar, P_bar <- F' P_bar F (symmetric), in place: derivatives by the step before.
+
+    They are given by the first N entries, and fill all A. T_bar (N, A) is scratch: P_bar F.
+    """
+    N, A = T_bar.shape
     E = A - N
     pairs = N // 2
-    for i in range(N):
-        for j in range(N):
-            bars.Q[k, i, j] += P_bar[i, j]
-    # T = F P, and T_bar = P_bar F (N, A).
-    for j in range(pairs):
-        q = pairs + j
-        for i in range(A):
-            T[j, i] = re[j] * P[j, i] - im[j] * P[q, i]
-            T[q, i] = im[j] * P[j, i] + re[j] * P[q, i]
-    for j in range(N):
-        for f in range(E):
-            t = gamma[j, f]
-            if t != 0.0:
-                for i in range(A):
-                    T[j, i] += t * P[N + f, i]
     for i in range(N):
         for j in range(pairs):
             q = pairs + j
@@ -120,25 +88,6 @@ def move_adjoint(k, layout, values, bars, m, P, m_bar, P_bar, T, T_bar):
             for j in range(N):
                 total += P_bar[i, j] * gamma[j, f]
             T_bar[i, N + f] = total
-    # F_bar = m_bar m' + 2 P_bar F P = m_bar m' + 2 P_bar T; P_bar is symmetric.
-    for j in range(pairs):
-        q = pairs + j
-        bars.re[k, j] += m_bar[j] * m[j] + m_bar[q] * m[q]
-        bars.im[k, j] += m_bar[q] * m[j] - m_bar[j] * m[q]
-    for i in range(N):
-        for j in range(pairs):
-            q = pairs + j
-            x = 2.0 * P_bar[i, j]
-            w = 2.0 * P_bar[i, q]
-            bars.re[k, j] += x * T[i, j] + w * T[i, q]
-            bars.im[k, j] += w * T[i, j] - x * T[i, q]
-    for f in range(E):
-        for j in range(N):
-            total = m_bar[j] * m[N + f]
-            for i in range(N):
-                total += 2.0 * P_bar[j, i] * T[i, N + f]
-            bars.gamma[k, j, f] += total
-    # P_bar <- F' P_bar F = F' T_bar, m_bar <- F' m_bar.
     for f in range(E):
         for i in range(A):
             total = 0.0
@@ -157,3 +106,68 @@ def move_adjoint(k, layout, values, bars, m, P, m_bar, P_bar, T, T_bar):
         x = m_bar[j]
         m_bar[j] = re[j] * x + im[j] * m_bar[q]
         m_bar[q] = re[j] * m_bar[q] - im[j] * x
+
+
+@njit(**BORROWING)
+def move(re, im, gamma, Q, m, P, T):
+    """State mean and covariance one step on, in place in the first N entries of m and P.
+
+    T (N, A) is scratch: on return T = F P with F = [Phi gamma], for the old P.
+    """
+    N, A = T.shape
+    E = A - N
+    pairs = N // 2
+    step_covariance(re, im, gamma, P, T)
+    for j in range(pairs):
+        k = pairs + j
+        x = m[j]
+        m[j] = re[j] * x - im[j] * m[k]
+        m[k] = im[j] * x + re[j] * m[k]
+    for j in range(N):
+        for f in range(E):
+            t = gamma[j, f]
+            if t != 0.0:
+                m[j] += t * m[N + f]
+    for i in range(N):
+        for j in range(pairs):
+            k = pairs + j
+            x = T[i, j]
+            w = T[i, k]
+            P[i, j] = re[j] * x - im[j] * w + Q[i, j]
+            P[i, k] = im[j] * x + re[j] * w + Q[i, k]
+        for j in range(N):
+            for f in range(E):
+                P[i, j] += T[i, N + f] * gamma[j, f]
+
+
+@njit(**BORROWING)
+def move_adjoint(k, layout, values, bars, m, P, m_bar, P_bar, T, T_bar):
+    """Reverse of `move` over step k: m, P are those before it; the bars change in place."""
+    re = values.re[k]
+    im = values.im[k]
+    gamma = values.gamma[k]
+    N, A = T.shape
+    pairs = N // 2
+    for i in range(N):
+        for j in range(N):
+            bars.Q[k, i, j] += P_bar[i, j]
+    step_covariance(re, im, gamma, P, T)
+    # F_bar = m_bar m' + 2 P_bar F P = m_bar m' + 2 P_bar T; P_bar is symmetric.
+    for j in range(pairs):
+        q = pairs + j
+        bars.re[k, j] += m_bar[j] * m[j] + m_bar[q] * m[q]
+        bars.im[k, j] += m_bar[q] * m[j] - m_bar[j] * m[q]
+    for i in range(N):
+        for j in range(pairs):
+            q = pairs + j
+            x = 2.0 * P_bar[i, j]
+            w = 2.0 * P_bar[i, q]
+            bars.re[k, j] += x * T[i, j] + w * T[i, q]
+            bars.im[k, j] += w * T[i, j] - x * T[i, q]
+    for f in range(A - N):
+        for j in range(N):
+            total = m_bar[j] * m[N + f]
+            for i in range(N):
+                total += 2.0 * P_bar[j, i] * T[i, N + f]
+            bars.gamma[k, j, f] += total
+    step_back(re, im, gamma, m_bar, P_bar, T_bar)
