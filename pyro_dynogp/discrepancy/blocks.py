@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pyro_dynogp._errors import invalid
+from pyro_dynogp.discrepancy.data_faults import Fault, faults, without_stuck
 from pyro_dynogp.prediction.clock import gap_between, joined
 from pyro_dynogp.record import Record
 
 if TYPE_CHECKING:
     from pyro_dynogp.inference.result import Fit
 
-# Fewest samples of the blocks B and C.
-FEWEST = 60
+# Fewest samples of the blocks B and C, and fewest of them that were measured.
+FEWEST, MEASURED = 60, 30
 # Shares of A and B where a record is cut anew.
 SHARES = (0.5, 0.25)
 # Stretches of B where it is shared between fit and search.
@@ -32,6 +34,7 @@ class Blocks:
         sealed: C, which nothing looks at before the end.
         refit: whether A is not what the fit was trained on.
         sentence: what is what.
+        faults: of the data. What a stuck sensor reports is missing from all three parts.
     """
 
     known: Record
@@ -39,6 +42,7 @@ class Blocks:
     sealed: Record
     refit: bool
     sentence: str
+    faults: tuple[Fault, ...] = ()
 
 
 def blocks_of(fit: Fit, record: Record, candidates: Record | None) -> Blocks:
@@ -46,11 +50,11 @@ def blocks_of(fit: Fit, record: Record, candidates: Record | None) -> Blocks:
 
     Where the record goes on after the training record, A is the training record and what follows
     is halved. Where it is the training record, or part of it, it is cut anew: half of it to fit,
-    a quarter to search, a quarter to report on.
+    a quarter to search, a quarter to report on. What a stuck sensor reports counts as missing.
 
     Raises:
         ValueError: where the fit has several training records, the clocks do not compare, or too
-            few samples are left.
+            few samples are left, or too few of an output were measured.
     """
     if len(fit.records) != 1:
         raise invalid(
@@ -89,13 +93,35 @@ def blocks_of(fit: Fit, record: Record, candidates: Record | None) -> Blocks:
             "record", expected=f"at least {2 * FEWEST} samples after the training record, or "
             f"{4 * FEWEST} of it", got=f"{len(record)} samples, {after} of them for training",
         )  # fmt: skip
+    found = _told(faults(record, list(record.extra)), record)
+    cleared = without_stuck(record, found)
+    for part, name in ((cleared[cut:second], "searched"), (cleared[second:], "reported on")):
+        measured = int((~part.missing).sum(0).min())
+        if measured < MEASURED:
+            raise invalid(
+                "record", expected=f"{MEASURED} samples or more of each output that were measured "
+                f"in the part to be {name}", got=f"{measured} of {len(part)}",
+                advice="Give a record that goes on for longer.",
+            )  # fmt: skip
+    refit = refit or not _same(cleared[:cut], record[:cut])
     held_out = np.zeros(second, dtype=bool)
     held_out[cut:] = True
     sentence = (
         f"Fitted to {cut} samples, searched on the {second - cut} after them, reported on the last "
         f"{len(record) - second}, which nothing looked at before."
     )
-    return Blocks(record[:second], held_out, record[second:], refit, sentence)
+    return Blocks(cleared[:second], held_out, cleared[second:], refit, sentence, tuple(found))
+
+
+def _told(found: Sequence[Fault], record: Record) -> list[Fault]:
+    """The faults, whose sentences also say what is done about them."""
+    stuck = [one.kind == "stuck" and one.channel in record.output_names for one in found]
+    return [
+        dataclasses.replace(one, sentence=f"{one.sentence} These samples count as missing.")
+        if is_stuck
+        else one
+        for one, is_stuck in zip(found, stuck, strict=True)
+    ]
 
 
 def shared(held_out: np.ndarray) -> np.ndarray:

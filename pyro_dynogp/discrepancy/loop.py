@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pyro_dynogp._errors import invalid
 from pyro_dynogp.discrepancy.blocks import blocks_of
 from pyro_dynogp.discrepancy.confirm import Confirmed
+from pyro_dynogp.discrepancy.data_faults import data_spikes
 from pyro_dynogp.discrepancy.effects import CATALOGUE, Effect
 from pyro_dynogp.discrepancy.evidence import Residuals
 from pyro_dynogp.discrepancy.extend import (
@@ -16,7 +17,6 @@ from pyro_dynogp.discrepancy.extend import (
     has_function,
     used_channels,
 )
-from pyro_dynogp.discrepancy.noise_effects import data_faults
 from pyro_dynogp.discrepancy.refits import poles_of, quick_fit
 from pyro_dynogp.discrepancy.report import Attempt, Report
 from pyro_dynogp.discrepancy.reporting import report_of
@@ -100,13 +100,14 @@ def close_loop(
     attempts: list[Attempt] = []
     accepted: list[tuple[Found, Confirmed]] = []
     reported: list[Found] = []
-    warnings: list[str] = []
+    channels = ("", *data.known.output_names, *names)
+    warnings = [fault.sentence for fault in data.faults if fault.channel in channels]
     left: tuple[str, ...] = ()
     for number in range(1, max_rounds + 1):
         known = {one.effect.name for one, _ in accepted}
         looked = rounds.look(current, known)
         if number == 1:
-            warnings += [*_faults(looked.residuals, data.known), *looked.notes]
+            warnings += [*_spikes(looked.residuals, data.known), *looked.notes]
         reported = _reported(looked.found, rounds.gate)
         left = rounds.left(looked)
         watch.stop("residual tests")
@@ -144,10 +145,10 @@ def close_loop(
     return report_of(base, extended, rounds, accepted, reported, attempts, warnings, left, watch)
 
 
-def _faults(residuals: Sequence[Residuals], record: Record) -> list[str]:
-    """Faults of the data, in words; samples that tests leave out are none."""
+def _spikes(residuals: Sequence[Residuals], record: Record) -> list[str]:
+    """Spikes of the outputs, in words, also in samples that tests leave out."""
     whole = [replace(one, output=record.outputs[:, a]) for a, one in enumerate(residuals)]
-    return [text for one in whole for text in data_faults(one)]
+    return [fault.sentence for one in whole if (fault := data_spikes(one)) is not None]
 
 
 def _names(fit: Fit, record: Record, candidates: Sequence[str] | Record | None) -> list[str]:

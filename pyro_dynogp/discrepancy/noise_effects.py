@@ -1,6 +1,6 @@
 """Effects of noise on one-step errors: heavy tails, and a size that depends on something.
 
-Serial structure is in `serial_effects`, faults of the data in `data_faults`.
+Serial structure is in `serial_effects`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from scipy import stats
 from scipy.optimize import minimize_scalar
 
 from pyro_dynogp._errors import invalid
-from pyro_dynogp.discrepancy.data_faults import data_faults
 from pyro_dynogp.discrepancy.evidence import Curve, Evidence, Residuals
 from pyro_dynogp.discrepancy.filters import fitted_filter
 from pyro_dynogp.discrepancy.responses import filtered
@@ -24,7 +23,7 @@ from pyro_dynogp.discrepancy.serial_effects import (
 from pyro_dynogp.discrepancy.sieve import columns_score, replicates, sieve, spanning
 from pyro_dynogp.signals import held
 
-__all__ = ["data_faults", "feedback", "heavy_tails", "heteroscedastic_noise", "process_noise"]
+__all__ = ["feedback", "heavy_tails", "heteroscedastic_noise", "process_noise"]
 
 REPLICATES = 400
 # Degrees of freedom that are looked through; beyond the last a Student-t is normal.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,6 +25,9 @@ from pyro_dynogp.record import Record
 if TYPE_CHECKING:
     from pyro_dynogp.inference.result import Fit
 
+# Scores that rise by less do not speak against what was added: effects of the noise change them
+# by chance.
+SLACK = 1.05
 SCORES = ("rmse", "mae", "nrmse", "crps", "coverage_50", "coverage_95")
 
 
@@ -52,6 +55,8 @@ def report_of(
     densities = [one_step_density(one, whole)[sealed] for one in (base, extended)]
     there = np.isfinite(densities[0])
     gain = densities[1][there] - densities[0][there]
+    elpd_gain, elpd_gain_error = float(gain.sum()), block_standard_error(gain)[0]
+    unpaid = does_not_pay(before, after, elpd_gain, elpd_gain_error) if accepted else []
     watch.stop("scores of the last block")
     tests = _tested([f for f, _ in accepted], (base, extended), whole, sealed, rounds)
     watch.stop("residual tests of the last block")
@@ -62,13 +67,13 @@ def report_of(
         outcome=_outcome(bool(accepted), bool(left)),
         before=before,
         after=after,
-        elpd_gain=float(gain.sum()),
-        elpd_gain_error=block_standard_error(gain)[0],
+        elpd_gain=elpd_gain,
+        elpd_gain_error=elpd_gain_error,
         fit=extended,
         base=base,
         attempts=tuple(attempts),
         left=left,
-        warnings=tuple(warnings),
+        warnings=(*warnings, *unpaid),
         data=data.sentence,
         tests=tests,
         sealed=data.sealed,
@@ -79,6 +84,22 @@ def report_of(
         model_after=words.describe(extended.model),
         seconds=dict(watch.seconds),
     )
+
+
+def does_not_pay(
+    before: Mapping[str, float], after: Mapping[str, float], gain: float, error: float
+) -> list[str]:
+    """A warning where forecasts of the last block are worse by both scores, or its density is."""
+    if gain >= 0.0 and any(after[name] <= SLACK * before[name] for name in ("rmse", "crps")):
+        return []
+    scores = ", ".join(
+        f"{name.upper()} {before[name]:.3g} -> {after[name]:.3g}" for name in ("rmse", "crps")
+    )
+    return [
+        f"What was added does not pay on the last block ({scores}, elpd {gain:+.1f} +- {error:.1f} "
+        f"nats): what held-out data speak for need not last. Look at the residuals there, and "
+        f"confirm it on another record before you rely on the extended model."
+    ]
 
 
 def _outcome(added: bool, left: bool) -> str:

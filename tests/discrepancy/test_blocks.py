@@ -89,3 +89,33 @@ def test_joined_records_are_the_record_they_were() -> None:
     whole = record(50)
     again = joined(whole[:20], whole[20:])
     assert again == whole
+
+
+def noisy(stuck: slice) -> dgp.Record:
+    rng = np.random.default_rng(0)
+    u, y = rng.standard_normal((2, 600))
+    y[stuck] = 0.5
+    return dgp.Record(np.arange(600) * 0.1, u, y)
+
+
+@pytest.mark.parametrize("stuck", [slice(450, 490), slice(490, 520), slice(520, 550)])
+def test_what_a_stuck_sensor_reports_is_missing_from_all_parts(stuck: slice) -> None:
+    whole = noisy(stuck)
+    found = blocks_of(fitted_to(whole[:400]), whole, None)
+    missing = np.concatenate([found.known.missing[:, 0], found.sealed.missing[:, 0]])
+    assert list(np.flatnonzero(missing)) == list(range(600))[stuck]
+    assert not found.refit
+    assert [one.sentence.endswith("count as missing.") for one in found.faults] == [True]
+
+
+def test_a_fit_to_a_stuck_sensor_is_made_again() -> None:
+    whole = noisy(slice(100, 150))
+    assert blocks_of(fitted_to(whole[:400]), whole, None).refit
+
+
+def test_too_few_measured_samples_are_refused() -> None:
+    whole = record(600)
+    y = whole.outputs.copy()
+    y[510:] = np.nan
+    with pytest.raises(ValueError, match="reported on, got 10 of 100"):
+        blocks_of(fitted_to(whole[:400]), whole.with_outputs(y), None)

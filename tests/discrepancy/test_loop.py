@@ -164,3 +164,15 @@ def test_a_record_without_inputs() -> None:
     (why,) = report.warnings
     assert why.startswith("Not tested for dead time, unmodelled dynamics: ")
     assert "no inputs" in why
+
+
+def test_what_a_stuck_sensor_reports_is_no_effect() -> None:
+    good = machine()
+    y = good.outputs[:, 0].copy()
+    y[340:400] = y[340]  # at the end of the block that is searched, and in the sealed one
+    fit = fitted(good)
+    found = close(fit, good.with_outputs(y))
+    assert "'y' is stuck once, 60 samples in all" in found.warnings[0]
+    assert found.outcome == "nothing missing"
+    assert np.isnan(found.sealed.outputs[: 400 - len(found.known)]).all()
+    assert found.before["rmse"] == pytest.approx(close(fit, good).before["rmse"], rel=0.15)

@@ -5,7 +5,6 @@ import pytest
 from scipy.signal import lfilter
 
 from pyro_dynogp.discrepancy import sieve
-from pyro_dynogp.discrepancy.data_faults import data_faults, faults
 from pyro_dynogp.discrepancy.noise_effects import (
     feedback,
     heavy_tails,
@@ -156,44 +155,3 @@ def test_too_few_samples_are_refused():
     for detector in (heavy_tails, heteroscedastic_noise, process_noise, feedback):
         with pytest.raises(ValueError, match="30"):
             detector(few)
-
-
-class TestDataFaults:
-    def test_clean_records_have_none(self):
-        assert not any(data_faults(residuals(s, 500)) for s in range(20))
-
-    def test_coarse_sensor_is_not_stuck(self):
-        r = residuals(0, 600, pole=0.95)
-        assert not data_faults(dataclasses.replace(r, output=np.round(r.output)))
-
-    def test_each_is_found(self):
-        r = residuals(0, 500)
-        y = r.output.copy()
-        y[100:112] = y[100]
-        y[200:205] = np.nan
-        y[300:320] = y[20:40]
-        y[400] += 30.0
-        found = {f.kind: f for f in faults(dataclasses.replace(r, output=y))}
-        assert set(found) == {"stuck", "gap", "duplicate", "spike"}
-        assert list(found["stuck"].samples) == list(range(100, 112))
-        assert list(found["gap"].samples) == list(range(200, 205))
-        assert list(found["duplicate"].samples) == list(range(300, 320))
-        assert list(found["spike"].samples) == [400]
-        assert "12 samples" in found["stuck"].sentence
-
-    def test_limit_that_comes_back_is_not_stuck(self):
-        r = residuals(2, 500, pole=0.9)
-        assert not [f for f in faults(limited(r)) if f.kind == "stuck"]
-
-    def test_stuck_candidate_and_skipped_rows(self):
-        r = residuals(0, 300)
-        w = np.random.default_rng(0).standard_normal(300)
-        w[50:70] = w[50]
-        late = r.time + 3.0 * (np.arange(300) > 100)
-        found = faults(dataclasses.replace(r, candidates={"wind": w}, time=late))
-        assert [(f.kind, f.channel) for f in found] == [("gap", "speed"), ("stuck", "wind")]
-
-
-def limited(r):
-    high = np.quantile(r.output, 0.8)
-    return dataclasses.replace(r, output=np.minimum(r.output, high))
