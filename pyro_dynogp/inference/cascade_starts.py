@@ -19,7 +19,7 @@ from pyro_dynogp.models.assembly import assemble
 from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.layers import INPUTS, Dynamic, Static, Wire
 from pyro_dynogp.models.linear import LinearDynamicGP
-from pyro_dynogp.models.systems import DynamicSystem, scaled_inputs, see
+from pyro_dynogp.models.systems import DynamicSystem, scaled_inputs, scaled_outputs, see
 from pyro_dynogp.moments import filtering, smoothing
 from pyro_dynogp.parallel import child_seeds
 from pyro_dynogp.record import Record
@@ -115,7 +115,7 @@ def starting_point(
     signals = [{INPUTS: u[:, :driving]} for u in inputs]
     if model.direct:
         values["direct"] = _direct(model, plan)
-    targets = [_scaled_outputs(scaling, record) for record in records]
+    targets = [scaled_outputs(scaling, record) for record in records]
     if model.direct:
         added = [u[:, driving:] @ values["direct"].mT for u in inputs]
         targets = [y - a for y, a in zip(targets, added, strict=True)]
@@ -195,7 +195,7 @@ def _linear_state(
     with torch.no_grad(), pyro.poutine.block():
         system = pyro.poutine.condition(twin.sample_system, data=dict(linear))(scaling)
         assembly = assemble(system, time_grid(record.time), scaled_inputs(scaling, record))
-        problem = assembly.with_outputs(_scaled_outputs(scaling, record))
+        problem = assembly.with_outputs(scaled_outputs(scaling, record))
         elements, _ = problem.elements()
         _, means, covariances, _, _ = filtering.run(problem.layout, elements[0])
         rows = np.zeros((0, problem.G.shape[-1]))
@@ -233,8 +233,3 @@ def _complete(model: Cascade, scaling: Scaling, values: Values) -> None:
     for name, node in trace.nodes.items():
         if node["type"] == "sample" and name not in values and not node["is_observed"]:
             values[name] = _middle(name, node)
-
-
-def _scaled_outputs(scaling: Scaling, record: Record) -> Tensor:
-    y = (record.outputs - scaling.output_offset) / scaling.output_scale
-    return torch.tensor(y, dtype=torch.float64)

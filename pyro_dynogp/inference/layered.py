@@ -33,9 +33,9 @@ from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.models.assembly import assemble
 from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.layers import Dynamic
-from pyro_dynogp.models.systems import scaled_inputs
+from pyro_dynogp.models.systems import scaled_inputs, scaled_outputs
 from pyro_dynogp.parallel import child_seeds, parallel_map, seeded
-from pyro_dynogp.prediction.cascade import smoothed_layers
+from pyro_dynogp.prediction.layers import smoothed_layers
 from pyro_dynogp.record import Record
 
 Values = dict[str, Tensor]
@@ -211,9 +211,7 @@ def starting_trajectories(model: Cascade, records: Sequence[Record], values: Val
             system = model.begin(system, states)
             inputs = scaled_inputs(model.scaling, record)
             assembly = assemble(system, time_grid(record.time), inputs)
-            y = torch.tensor(
-                (record.outputs - model.scaling.output_offset) / model.scaling.output_scale
-            )
+            y = scaled_outputs(model.scaling, record)
             found = smoothed_layers(assembly, assembly.with_outputs(y), record.time)
         for one in model.wires:
             integrated = one.last and model.integrate == "last"

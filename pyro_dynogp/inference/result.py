@@ -27,9 +27,10 @@ from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.collapsed import collapsed_of
 from pyro_dynogp.models.linear import LinearDynamicGP
 from pyro_dynogp.prediction import cascade as _cascade
+from pyro_dynogp.prediction import layers as _layers
 from pyro_dynogp.prediction import linear as _linear
 from pyro_dynogp.prediction.beginning import beginning
-from pyro_dynogp.prediction.cascade import LayerTrajectory, StaticBand
+from pyro_dynogp.prediction.layers import LayerTrajectory, StaticBand
 from pyro_dynogp.prediction.prediction import Prediction
 from pyro_dynogp.record import Record
 from pyro_dynogp.scaling import Scaling
@@ -162,7 +163,7 @@ class Fit:
         gives the trajectories that the inputs alone say.
         """
         self._only_cascade("layers")
-        return _cascade.layers(self, record)
+        return _layers.layers(self, record)
 
     def static_function(
         self, name: str, record: Record, *, channel: int = 0, points: int = 200
@@ -174,7 +175,7 @@ class Fit:
             channel: the input that varies, others at their mean. points: number of points.
         """
         self._only_cascade("static_function")
-        return _cascade.static_function(self, name, record, channel, points)
+        return _layers.static_function(self, name, record, channel, points)
 
     def _only_cascade(self, what: str) -> None:
         if not isinstance(self.model, Cascade):

@@ -190,3 +190,9 @@ def scaled_inputs(scaling: Scaling, record: Record, inputs: Tensor | None = None
     if not u.shape[-1]:
         return u
     return (u - as_tensor(scaling.input_offset)) / as_tensor(scaling.input_scale)
+
+
+def scaled_outputs(scaling: Scaling, record: Record) -> Tensor:
+    """Outputs (n, n_y) of a record, in standard deviations of the training record."""
+    y = record.tensors().outputs
+    return (y - as_tensor(scaling.output_offset)) / as_tensor(scaling.output_scale)

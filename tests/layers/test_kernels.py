@@ -31,7 +31,8 @@ from gpytorch.priors import (
 )
 from torch.distributions import constraints
 
-from pyro_dynogp.layers.kernels import SampledKernel, hyperprior, sample_kernel
+from pyro_dynogp.layers.hyperpriors import hyperprior
+from pyro_dynogp.layers.kernels import SampledKernel, sample_kernel
 
 
 class TentKernel(Kernel):
