@@ -12,7 +12,7 @@ import pandas as pd
 from pyro_dynogp._errors import invalid
 from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.loo import Target, loo
-from pyro_dynogp.prediction.prediction import Prediction
+from pyro_dynogp.prediction.prediction import Parts, Prediction
 from pyro_dynogp.record import Record
 
 if TYPE_CHECKING:
@@ -228,17 +228,15 @@ def mix(predictions: Sequence[Prediction], weights: np.ndarray) -> Prediction:
         [w * one.component_weights for w, one in zip(weights, predictions, strict=True)]
     )
     mean = sum(w * one.mean for w, one in zip(weights, predictions, strict=True))
-    names = list(dict.fromkeys(name for one in predictions for name in one.parts))
-    zero = np.zeros_like(first.mean)
-    parts = {
-        name: sum(
-            w * one.parts.get(name, zero) for w, one in zip(weights, predictions, strict=True)
-        )
-        for name in names
-    }
-    parts["choice of model"] = sum(
-        w * (one.mean - mean) ** 2 for w, one in zip(weights, predictions, strict=True)
-    )
+
+    def parts() -> dict[str, np.ndarray]:
+        found = {name: np.zeros_like(first.mean) for one in predictions for name in one.parts}
+        found["choice of model"] = np.zeros_like(first.mean)
+        for w, one in zip(weights, predictions, strict=True):
+            for name, part in one.parts.items():
+                found[name] = found[name] + w * part
+            found["choice of model"] += w * (one.mean - mean) ** 2
+        return found
 
     def draw() -> np.ndarray:
         samples = [one.samples for one in predictions]
@@ -261,7 +259,7 @@ def mix(predictions: Sequence[Prediction], weights: np.ndarray) -> Prediction:
         np.concatenate([one.component_mean for one in predictions]),
         np.concatenate([one.component_variance for one in predictions]),
         np.concatenate(noise),
-        parts,
+        Parts(parts),
         draw,
         kind,
         component_weights,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,7 +20,7 @@ from pyro_dynogp.moments.problem import each
 from pyro_dynogp.parallel import seeded
 from pyro_dynogp.prediction.beginning import beginning, cascade_of
 from pyro_dynogp.prediction.clock import following, gap_between, one_record
-from pyro_dynogp.prediction.prediction import Prediction
+from pyro_dynogp.prediction.prediction import Parts, Prediction
 from pyro_dynogp.prediction.sampling import (
     Drawn,
     JointState,
@@ -141,22 +142,28 @@ def _forward(
     batch = system.batch_shape
     each_draw = max(2, -(-samples // max(1, batch.numel())))
     shape = torch.Size((each_draw, *batch))
-    with seeded(seed):
-        random = Randomness.draw(system, len(grid), shape)
-    scale, shift = _units(fit)
-    on = Switches.all_on(system, process_noise, several_channels=not fit.collapsed)
 
-    def at(switches: Switches) -> Drawn:
+    def drawn_with(random: Randomness, switches: Switches) -> Drawn:
         numbers = random if switches.any else random.first
         return draw_layers(system, grid, inputs, start, numbers, switches)
 
-    full = at(on)
+    def fresh() -> Randomness:  # the same each time: cheaper to draw again than to keep
+        with seeded(seed):
+            return Randomness.draw(system, len(grid), shape)
+
+    scale, shift = _units(fit)
+    on = Switches.all_on(system, process_noise, several_channels=not fit.collapsed)
+    full = drawn_with(fresh(), on)
     mean = shift + scale * _flat(full.mean)
     variance = scale**2 * _flat(full.variance)
     generator = np.random.default_rng(seed)
     noise = scale**2 * _noise_variance(system, sd, len(mean), generator)
-    parts = _decompose(system, at, on, scale)
-    parts["measurement noise"] = noise.mean(0)
+
+    def parts() -> dict[str, np.ndarray]:
+        with torch.no_grad():
+            found = _decompose(system, partial(drawn_with, fresh()), on, scale)
+        return found | {"measurement noise": noise.mean(0)}
+
     # A joint sample of the last layer: its own draw where it is dynamic.
     last = system.wires[-1].name
     drawn = mean
@@ -171,7 +178,7 @@ def _forward(
         return y[generator.permutation(len(y))[:samples]]
 
     names = fit.scaling.output_names
-    return Prediction(record.time, names, mean, variance, noise, parts, draw, kind)
+    return Prediction(record.time, names, mean, variance, noise, Parts(parts), draw, kind)
 
 
 def _decompose(

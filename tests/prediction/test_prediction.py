@@ -11,7 +11,7 @@ from scipy import optimize, stats
 
 import pyro_dynogp as dgp
 from pyro_dynogp.prediction.mixture_score import mixture_crps
-from pyro_dynogp.prediction.prediction import Prediction
+from pyro_dynogp.prediction.prediction import Parts, Prediction
 
 
 def mixture(draws=5, n=7, n_y=2, seed=0):
@@ -172,3 +172,18 @@ def test_scores_refuse_what_does_not_belong_together():
         dgp.scores(p, dgp.Record(time=record.time))
     with pytest.raises(ValueError, match="expected measured samples"):
         dgp.scores(p, record.with_outputs(np.full(20, np.nan)))
+
+
+def test_shares_of_the_variance_are_computed_once_and_only_where_asked_for():
+    calls = []
+
+    def compute():
+        calls.append(1)
+        return {"noise": np.ones((3, 1))}
+
+    parts = Parts(compute)
+    assert not calls
+    assert list(parts) == ["noise"]
+    assert len(parts) == 1
+    assert parts["noise"].shape == (3, 1)
+    assert len(calls) == 1
