@@ -173,7 +173,7 @@ EXPERIMENTS = {
     ),
     "circuit": Experiment(
         "Wiener-Hammerstein with process noise", _circuit, (5, "static", 5), (True, False),
-        seconds=600.0, seeds=(0,), follows=False, test_process_noise=False, unit="V",
+        seconds=600.0, seeds=(0, 1, 2), follows=False, test_process_noise=False, unit="V",
         targets={"rmse": 0.020, "crps": 0.012, "rmse swept sine": 0.021},
         paper={"rmse": (0.029, 0.034, 0.120), "mae": (0.024, 0.028, 0.096),
                "crps": (0.016, np.nan, 0.077)},
