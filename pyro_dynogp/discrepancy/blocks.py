@@ -53,8 +53,8 @@ def blocks_of(fit: Fit, record: Record, candidates: Record | None) -> Blocks:
     a quarter to search, a quarter to report on. What a stuck sensor reports counts as missing.
 
     Raises:
-        ValueError: where the fit has several training records, the clocks do not compare, or too
-            few samples are left, or too few of an output were measured.
+        ValueError: where the fit has several training records, the record has other outputs or a
+            clock that does not compare, or too few samples are left or were measured.
     """
     if len(fit.records) != 1:
         raise invalid(
@@ -63,6 +63,11 @@ def blocks_of(fit: Fit, record: Record, candidates: Record | None) -> Blocks:
         )  # fmt: skip
     record = with_candidates(record, candidates)
     training = fit.records[0]
+    if record.output_names != training.output_names:
+        raise invalid(
+            "record", expected=f"the outputs {list(training.output_names)} that were fitted",
+            got=f"{list(record.output_names)}", advice="Record.select chooses and orders channels.",
+        )  # fmt: skip
     shift = _shift(training, record)
     tolerance = 1e-6 * training.sampling_time
     begin, end = training.time[0] + shift, training.time[-1] + shift

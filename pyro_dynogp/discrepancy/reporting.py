@@ -89,8 +89,14 @@ def report_of(
 def does_not_pay(
     before: Mapping[str, float], after: Mapping[str, float], gain: float, error: float
 ) -> list[str]:
-    """A warning where forecasts of the last block are worse by both scores, or its density is."""
-    if gain >= 0.0 and any(after[name] <= SLACK * before[name] for name in ("rmse", "crps")):
+    """A warning where forecasts of the last block are worse by both scores, or clearly less likely.
+
+    Args:
+        before, after: scores of the forecasts [output].
+        gain, error: in log density, with its block standard error [nats].
+    """
+    worse = all(after[name] > SLACK * before[name] for name in ("rmse", "crps"))
+    if not worse and gain > -2.0 * error:
         return []
     scores = ", ".join(
         f"{name.upper()} {before[name]:.3g} -> {after[name]:.3g}" for name in ("rmse", "crps")

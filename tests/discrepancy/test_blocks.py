@@ -69,6 +69,8 @@ def test_what_cannot_be_cut_is_refused() -> None:
         blocks_of(fitted_to(whole[:100]), whole[:150], None)
     with pytest.raises(ValueError, match="before the training record"):
         blocks_of(fitted_to(whole[100:400]), whole, None)
+    with pytest.raises(ValueError, match=r"outputs \['y'\] that were fitted, got \[\]"):
+        blocks_of(fitted_to(whole[:400]), whole.select(outputs=[]), None)
     stamped = replace_clock(whole)
     with pytest.raises(ValueError, match="same kind of clock"):
         blocks_of(fitted_to(whole[:400]), stamped, None)

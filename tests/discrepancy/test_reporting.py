@@ -13,7 +13,8 @@ BEFORE = {"rmse": 1.0, "crps": 0.5}
     ("after", "gain", "warned"),
     [
         ({"rmse": 0.5, "crps": 0.25}, 20.0, False),
-        ({"rmse": 0.5, "crps": 0.25}, -1.0, True),  # forecasts are better, its density is not
+        ({"rmse": 0.5, "crps": 0.25}, -5.0, False),  # within two standard errors
+        ({"rmse": 0.5, "crps": 0.25}, -7.0, True),  # forecasts are better, the density is not
         ({"rmse": 1.02, "crps": 0.51}, 20.0, False),  # noise of another kind
         ({"rmse": 1.3, "crps": 0.4}, 20.0, False),  # one of the scores is better
         ({"rmse": 1.3, "crps": 0.7}, 20.0, True),
