@@ -10,6 +10,7 @@ import pyro_dynogp as dgp
 from tests.benchmarks import circumstances
 from tests.benchmarks.paper import bound, ours, run
 from tests.benchmarks.paper.experiments import CIRCUIT_VARIABLE, EXPERIMENTS
+from tests.benchmarks.paper.figures import complete_seeds
 from tests.benchmarks.paper.page import number, page, spread
 from tests.benchmarks.paper.prediction import Predicted, scores
 
@@ -128,6 +129,9 @@ def test_page(tmp_path):
     assert text.endswith("![coupled drives, second record](pictures/drives_2.png)")
     picture = pictures / "drives_2.png"
     assert picture.stat().st_size > 10_000
+    # Another seed serves where the first one's are gone, if there are those of all methods.
+    assert complete_seeds(rows[:4], tmp_path / "drives_2") == [0]
+    assert complete_seeds(rows[:3], tmp_path / "drives_2") == [0, 1, 2]
     # Where predictions are gone, the picture stays as it is.
     (tmp_path / "drives_2" / "dynoNet" / "0.npz").unlink()
     before = picture.stat().st_mtime_ns

@@ -25,16 +25,28 @@ def predictions_file(folder: Path, row: Row) -> Path:
     return folder / folder_name(row["method"]) / f"{row['seed']}.npz"
 
 
+def complete_seeds(rows: Sequence[Row], folder: Path) -> list[int]:
+    """Seeds of which the predictions of all methods are there."""
+    there = {(r["method"], r["seed"]) for r in rows if predictions_file(folder, r).exists()}
+    methods = {row["method"] for row in rows}
+    seeds = sorted({row["seed"] for row in rows})
+    return [seed for seed in seeds if all((method, seed) in there for method in methods)]
+
+
 def _arrays(folder: Path, row: Row) -> Mapping[str, np.ndarray]:
     with np.load(predictions_file(folder, row)) as file:
         return {key: file[key] for key in file.files}
 
 
 def experiment_figure(experiment: Experiment, rows: Sequence[Row], folder: Path, to: Path) -> None:
-    """The first test record with our band and the means of the peers; RMSE of all methods."""
-    tests = experiment.load(experiment.seeds[0])[1]
+    """The first test record with our band and the means of the peers; RMSE of all methods.
+
+    Of the first seed whose predictions are all there.
+    """
+    seed = complete_seeds(rows, folder)[0]
+    tests = experiment.load(seed)[1]
     name, record = next(iter(tests.items()))
-    first = {row["method"]: row for row in rows if row["seed"] == experiment.seeds[0]}
+    first = {row["method"]: row for row in rows if row["seed"] == seed}
     begin = max(0, (len(record) - SHOWN) // 2)
     here = slice(begin, min(len(record), begin + SHOWN))
     figure = Figure(figsize=(10.0, 6.4), layout="constrained")

@@ -14,7 +14,12 @@ from tests.benchmarks.circumstances import USUAL, sentence
 from tests.benchmarks.markdown import table
 from tests.benchmarks.paper.bound import System, clean_error_bound
 from tests.benchmarks.paper.experiments import EXPERIMENTS, Experiment
-from tests.benchmarks.paper.figures import experiment_figure, predictions_file, study_figure
+from tests.benchmarks.paper.figures import (
+    complete_seeds,
+    experiment_figure,
+    predictions_file,
+    study_figure,
+)
 from tests.benchmarks.paper.prediction import OURS
 
 Row = Mapping[str, Any]
@@ -69,9 +74,11 @@ def _section(experiment: Experiment, rows: Sequence[Row], folder: Path, picture:
     if experiment.system is not None:
         parts += _against_peers(done, experiment.system)
     parts += _notes(rows)
-    if done and all(predictions_file(folder, row).exists() for row in done):
-        draw = study_figure if experiment.simulated else experiment_figure
-        draw(experiment, done, folder, picture)
+    if experiment.simulated:
+        if done and all(predictions_file(folder, row).exists() for row in done):
+            study_figure(experiment, done, folder, picture)
+    elif complete_seeds(done, folder):
+        experiment_figure(experiment, done, folder, picture)
     if picture.exists():
         parts.append(f"![{experiment.name}]({picture.parent.name}/{picture.name})")
     return parts
