@@ -234,7 +234,7 @@ def mix(predictions: Sequence[Prediction], weights: np.ndarray) -> Prediction:
         found["choice of model"] = np.zeros_like(first.mean)
         for w, one in zip(weights, predictions, strict=True):
             for name, part in one.parts.items():
-                found[name] = found[name] + w * part
+                found[name] += w * part
             found["choice of model"] += w * (one.mean - mean) ** 2
         return found
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -42,7 +41,7 @@ class Blocks:
     sealed: Record
     refit: bool
     sentence: str
-    faults: tuple[Fault, ...] = ()
+    faults: tuple[Fault, ...]
 
 
 def blocks_of(fit: Fit, record: Record, candidates: Record | None) -> Blocks:
@@ -98,7 +97,7 @@ def blocks_of(fit: Fit, record: Record, candidates: Record | None) -> Blocks:
             "record", expected=f"at least {2 * FEWEST} samples after the training record, or "
             f"{4 * FEWEST} of it", got=f"{len(record)} samples, {after} of them for training",
         )  # fmt: skip
-    found = _told(faults(record, list(record.extra)), record)
+    found = faults(record, list(record.extra))
     cleared = without_stuck(record, found)
     for part, name in ((cleared[cut:second], "searched"), (cleared[second:], "reported on")):
         measured = int((~part.missing).sum(0).min())
@@ -116,17 +115,6 @@ def blocks_of(fit: Fit, record: Record, candidates: Record | None) -> Blocks:
         f"{len(record) - second}, which nothing looked at before."
     )
     return Blocks(cleared[:second], held_out, cleared[second:], refit, sentence, tuple(found))
-
-
-def _told(found: Sequence[Fault], record: Record) -> list[Fault]:
-    """The faults, whose sentences also say what is done about them."""
-    stuck = [one.kind == "stuck" and one.channel in record.output_names for one in found]
-    return [
-        dataclasses.replace(one, sentence=f"{one.sentence} These samples count as missing.")
-        if is_stuck
-        else one
-        for one, is_stuck in zip(found, stuck, strict=True)
-    ]
 
 
 def shared(held_out: np.ndarray) -> np.ndarray:

@@ -96,8 +96,8 @@ def _runs(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return starts, np.diff(np.append(starts, len(x)))
 
 
-def _stuck(record: Record, name: str, x: np.ndarray, driven: bool) -> Fault | None:
-    """Runs of equal values that are far too long; of a driven channel while the inputs change."""
+def _stuck(record: Record, name: str, x: np.ndarray, is_output: bool) -> Fault | None:
+    """Runs of equal values that are far too long; of an output while the inputs change."""
     starts, lengths = _runs(x)
     known = np.isfinite(x[starts])
     starts, lengths = starts[known], lengths[known]
@@ -111,7 +111,7 @@ def _stuck(record: Record, name: str, x: np.ndarray, driven: bool) -> Fault | No
     limit = max(chance, TIMES * float(np.quantile(lengths, 0.98)), 5.0)
     long = [(a, a + m) for a, m in zip(starts, lengths, strict=True) if m >= limit]
     runs = [
-        run for run in long if not (_at_a_limit(x, run[0]) or (driven and _rests(record, *run)))
+        run for run in long if not (_at_a_limit(x, run[0]) or (is_output and _rests(record, *run)))
     ]
     if not runs:
         return None
@@ -122,6 +122,8 @@ def _stuck(record: Record, name: str, x: np.ndarray, driven: bool) -> Fault | No
         f"{(b - a) * record.sampling_time:.4g} {record.time_unit} from {record.time[a]:.5g} "
         f"{record.time_unit} at {x[a]:.5g}."
     )
+    if is_output:  # see `without_stuck`
+        text += " These samples count as missing."
     return Fault("stuck", name, samples, text)
 
 
