@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
@@ -35,8 +36,10 @@ def structure_left(
     which is exact where they are independent and safe where they go together.
 
     Args:
-        residuals: of one output (n,). plain: those of the model without its process noise, which
-            takes up what should be left; where there are any the fifth way looks at these.
+        residuals: of one output (n,). plain: those that the fifth way looks at, by default the
+            same: process noise takes up what it looks for, so a loop gives those of the model
+            without, and gives it what the model was fitted to as well. There a residual is smaller
+            than the noise, never larger by more than chance, which makes a test safe.
         seed: of the simulated nulls.
 
     Returns:
@@ -58,7 +61,7 @@ def structure_left(
         "one-step errors are not normal": _not_normal(v[np.isfinite(v)], seed),
         "the residual follows inputs, other channels or time": _follows(r, seed),
         "the residual follows products of inputs at two times, or a response that changes": (
-            beyond_catalogue(r if plain is None else plain, seed)[0]
+            beyond_catalogue(r if plain is None else plain, seed).p_value
         ),
     }
     smallest = min(ways.values())
@@ -105,24 +108,34 @@ def _follows(r: Residuals, seed: int) -> float:
     return _explained(r, blocks, seed).p_value
 
 
-def beyond_catalogue(residuals: Residuals, seed: int = 0) -> tuple[float, float]:
-    """Test for what no effect of the catalogue does, see `interactions`.
+@dataclass(frozen=True, eq=False)
+class Beyond:
+    """What no effect of the catalogue does, in one residual.
+
+    Attributes:
+        p_value: probability of as much where there is none. gain: in log-likelihood [nats].
+        fitted: (n,) what it explains of the residual [output].
+    """
+
+    p_value: float
+    gain: float
+    fitted: np.ndarray
+
+
+def beyond_catalogue(residuals: Residuals, seed: int = 0) -> Beyond:
+    """Test for products of inputs at two times, and responses that change: see `interactions`.
 
     Args:
         residuals: of one output (n,). seed: of the simulated null.
-
-    Returns:
-        Probability of as much that products of inputs at two times, or responses that change,
-        explain where there are none; and gain in log-likelihood of the best of them [nats].
 
     Raises:
         ValueError: where fewer than 30 held-out samples are measured.
     """
     blocks = interactions(residuals)
     if not blocks:
-        return 1.0, 0.0
+        return Beyond(1.0, 0.0, np.zeros(len(residuals)))
     found = _explained(residuals, blocks, seed)
-    return found.p_value, found.gain
+    return Beyond(found.p_value, found.gain, found.fitted)
 
 
 def _slow(r: Residuals) -> np.ndarray:

@@ -23,8 +23,8 @@ from pyro_dynogp.signals import delayed
 # Delays between the factors of a product, from one step to a share of what is looked at, and to
 # so many steps.
 DELAYS, SHARE, LONGEST = 8, 0.15, 60
-# Cycles of slow cosines and sines over what is looked at.
-COSINES, SINES = (0.5, 1.0, 1.5, 2.0), (1.0, 2.0)
+# Cycles of slow cosines and sines over what is looked at, each of so many samples at least.
+COSINES, SINES, SLOW = tuple(0.5 * k for k in range(1, 9)), (1.0, 2.0, 3.0, 4.0), 75
 # Inputs that are multiplied: those that do most.
 INPUTS = 3
 
@@ -69,8 +69,9 @@ def _changing(signals: list[np.ndarray], r: Residuals) -> list[np.ndarray]:
     """Signals times slow waves over the stretch that is looked at."""
     looked = r.time[r.held_out]
     s = np.clip((r.time - looked[0]) / (looked[-1] - looked[0]), 0.0, 1.0)
-    waves = [np.cos(2.0 * np.pi * k * s) for k in COSINES]
-    waves += [np.sin(2.0 * np.pi * k * s) for k in SINES]
+    most = max(looked_at(r) / SLOW, 0.5)
+    waves = [np.cos(2.0 * np.pi * k * s) for k in COSINES if k <= most]
+    waves += [np.sin(2.0 * np.pi * k * s) for k in SINES if k <= most]
     return [signal * wave for signal in signals if signal.any() for wave in waves]
 
 

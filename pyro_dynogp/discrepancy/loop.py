@@ -99,6 +99,7 @@ def close_loop(
     model: Model = replace(fit.model, scaling=None)
     attempts: list[Attempt] = []
     accepted: list[tuple[Found, Confirmed]] = []
+    seen: list[Sequence[Residuals]] = []  # before each of them was added
     reported: list[Found] = []
     channels = ("", *data.known.output_names, *names)
     warnings = [fault.sentence for fault in data.faults if fault.channel in channels]
@@ -121,10 +122,11 @@ def close_loop(
         winner, larger = confirmed.winner, confirmed.model
         if winner is None or larger is None:
             break
-        if rounds.doubtful(looked, winner):
+        if rounds.doubtful(winner, looked.whole, rounds.beyond(looked.residuals)):
             confirmed = replace(confirmed, ties=(*confirmed.ties, OUTSIDE))
-        watch.stop("residual tests")
         accepted.append((winner, confirmed))
+        seen.append(looked.whole)
+        watch.stop("residual tests")
         model = larger
         again = rounds.hold_out_less(winner)
         if confirmed.fit is not None and not again:
@@ -137,6 +139,13 @@ def close_loop(
         looked = rounds.look(current, {one.effect.name for one, _ in accepted})
         left = rounds.left(looked)
         reported = _reported(looked.found, rounds.gate)
+        watch.stop("residual tests")
+    if accepted and left:
+        beyond = rounds.beyond(looked.whole)
+        for k, (winner, confirmed) in enumerate(accepted):
+            if OUTSIDE not in confirmed.ties and rounds.doubtful(winner, seen[k], beyond):
+                confirmed = replace(confirmed, ties=(*confirmed.ties, OUTSIDE))
+                accepted[k] = winner, confirmed
         watch.stop("residual tests")
     fits = [first, current] if accepted else [first]
     fitted = _final(fits, data.known, workers, progress)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from pyro_dynogp.discrepancy.extend import (
     used_channels,
     without_process_noise,
 )
-from pyro_dynogp.discrepancy.gate import beyond_catalogue, structure_left
+from pyro_dynogp.discrepancy.gate import Beyond, beyond_catalogue, structure_left
 from pyro_dynogp.discrepancy.refits import quick_fit
 from pyro_dynogp.discrepancy.residuals import residuals_of
 from pyro_dynogp.discrepancy.search import Found, look, merged
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
 # Families of effects that go with inputs.
 OF_INPUTS = ("paths", "shapes")
-# What no effect of the catalogue does explains certainly more of a residual than an effect that is
-# added where it gains so many times as much. (Where an effect is what was missing it gains at most
-# as much, as products of an input with its own past resemble its square.)
+# An effect is doubtful where what no effect of the catalogue does gains so many times as much, and
+# the effect is not seen beside it. (Where the effect is what was missing that gains at most as
+# much, as products of an input resemble its square, and nothing once it is added.)
 FAR = 2.0
 
 
@@ -55,13 +55,13 @@ class Looked:
     """What a round sees.
 
     Attributes:
-        residuals: of every output. plain: those of the model without its process noise; the same
-            ones where it has none.
+        residuals: of every output. whole: those of the model without its process noise, also of
+            what it was fitted to: what no part of the model can follow is left there as well.
         found: evidence of all effects but those that are known. notes: what else there is to say.
     """
 
     residuals: Sequence[Residuals]
-    plain: Sequence[Residuals]
+    whole: Sequence[Residuals]
     found: Sequence[Found]
     notes: Sequence[str]
 
@@ -124,7 +124,9 @@ class Rounds:
             found = merged(found, look(others, structural, **options)[0])
             if not known:  # of the model as given
                 notes += self.hiding(fit, again)
-        return Looked(residuals, others, found, notes)
+        everywhere = np.ones(len(self.data.known), dtype=bool)
+        whole = [replace(one, held_out=everywhere) for one in others]
+        return Looked(residuals, whole, found, notes)
 
     def hiding(self, fit: Fit, plain: Fit) -> list[str]:
         """In words, whether a model forecasts held-out data better without its process noise."""
@@ -156,12 +158,38 @@ class Rounds:
             seed=self.seed, level=self.level, workers=self.workers, progress=self.progress,
         )  # fmt: skip
 
-    def doubtful(self, looked: Looked, winner: Found) -> bool:
-        """Whether what no effect of the catalogue does explains far more than the winner."""
-        tests = [beyond_catalogue(one, seed=self.seed) for one in looked.residuals]
-        return any(
-            p * len(tests) <= self.gate and gain > FAR * winner.evidence.gain for p, gain in tests
-        )
+    def beyond(self, residuals: Sequence[Residuals]) -> list[Beyond]:
+        """What no effect of the catalogue does in each output, nothing where that is not certain.
+
+        Gains are zero there, and so is what is fitted.
+        """
+        tests = [beyond_catalogue(one, seed=self.seed) for one in residuals]
+        return [
+            one if one.p_value * len(tests) <= self.gate
+            else Beyond(one.p_value, 0.0, np.zeros_like(one.fitted))
+            for one in tests
+        ]  # fmt: skip
+
+    def doubtful(
+        self, winner: Found, residuals: Sequence[Residuals], beyond: Sequence[Beyond]
+    ) -> bool:
+        """Whether what no effect of the catalogue does explains far more, and what the effect does.
+
+        Args:
+            winner: the effect. residuals: of every output, of the model without it.
+            beyond: of each output.
+        """
+        if max(one.gain for one in beyond) <= FAR * winner.evidence.gain:
+            return False
+        rest = [
+            replace(one, output=one.output - other.fitted)
+            for one, other in zip(residuals, beyond, strict=True)
+        ]
+        # From the channel it was found in; noise is seen in innovations, which stay as they are.
+        found, _ = look(rest, [winner.effect], seed=self.seed, workers=1)
+        channel = winner.evidence.where.get("channel")
+        again = [f.evidence for f in found if f.evidence.where.get("channel") == channel]
+        return all(one.p_value > self.level for one in again)
 
     def hold_out_less(self, winner: Found) -> bool:
         """Give parts of B to the fit where an effect begins there; whether that was needed."""
@@ -187,6 +215,6 @@ class Rounds:
             return (f"Residual tests speak for (false discovery rate): {rates}.",)
         omnibus = [
             structure_left(one, other, seed=self.seed)
-            for one, other in zip(looked.residuals, looked.plain, strict=True)
+            for one, other in zip(looked.residuals, looked.whole, strict=True)
         ]
         return tuple(said for p, said in omnibus if p * len(omnibus) <= self.gate)

@@ -5,7 +5,8 @@ import pytest
 from scipy.signal import lfilter
 
 from pyro_dynogp.discrepancy import sieve
-from pyro_dynogp.discrepancy.gate import structure_left
+from pyro_dynogp.discrepancy.gate import beyond_catalogue, structure_left
+from pyro_dynogp.discrepancy.responses import responses
 
 from .series import check_rate, in_other_units, residuals, share
 
@@ -15,6 +16,19 @@ def test_level_is_kept(monkeypatch):
     monkeypatch.setattr(sieve, "FEWEST", 19)
     series = (residuals(s, 150, deviation=0.02) for s in range(100))
     check_rate([structure_left(r, seed=s)[0] for s, r in enumerate(series)])
+
+
+def test_level_is_kept_in_what_a_model_was_fitted_to(monkeypatch):
+    """Least squares take their part of the noise; what they leave follows nothing more for it."""
+    monkeypatch.setattr(sieve, "REPLICATES", 19)
+    monkeypatch.setattr(sieve, "FEWEST", 19)
+    p_values = []
+    for seed in range(100):
+        r = residuals(1000 + seed, 150)
+        columns = np.column_stack([responses(r.inputs, r.step, r.time, constants=4), np.ones(150)])
+        weights = np.linalg.lstsq(columns, r.output, rcond=None)[0]
+        p_values.append(beyond_catalogue(dataclasses.replace(r, mean=columns @ weights)).p_value)
+    check_rate(p_values)
 
 
 def test_nothing_left_is_said():

@@ -49,11 +49,15 @@ def test_process_noise_that_costs_forecasts_is_pointed_out(late, noise, hides):
         assert any("process_noise=False" in one for one in looked.notes)
 
 
-def test_what_is_left_is_said():
-    """By single effects where one is certain, else by the omnibus test; nothing where none is."""
+@pytest.fixture(scope="module")
+def rounds():
     record = oscillator(0, 0.0, seed=2)
     fit = dgp.fit(MODEL, record[:240], restarts=1, workers=1, progress=False)
-    rounds = Rounds(blocks_of(fit, record, None), [], 0, 0.05, 8, (), 1, False)
+    return Rounds(blocks_of(fit, record, None), [], 0, 0.05, 8, (), 1, False)
+
+
+def test_what_is_left_is_said(rounds):
+    """By single effects where one is certain, else by the omnibus test; nothing where none is."""
     quiet = residuals(3, 400)
     product = residuals(3, 400, effect=lambda t, mean, u: share(u[:, 0] * np.roll(u[:, 0], 6), 0.3))
     found = [
@@ -69,16 +73,36 @@ def test_what_is_left_is_said():
     assert "products of inputs" in said
 
 
-def test_a_small_winner_beside_a_cause_outside_the_catalogue_is_doubtful():
-    record = oscillator(0, 0.0, seed=2)
-    fit = dgp.fit(MODEL, record[:240], restarts=1, workers=1, progress=False)
-    rounds = Rounds(blocks_of(fit, record, None), [], 0, 0.05, 8, (), 1, False)
-    product = residuals(3, 400, effect=lambda t, mean, u: share(u[:, 0] * np.roll(u[:, 0], 6), 0.3))
-    small, large = (
-        Found(effects.LevelShift(), Evidence("level shift", 5.0, 1e-6, gain, 0.1), 1e-5)
-        for gain in (8.0, 300.0)
-    )
-    assert rounds.doubtful(Looked([product], [product], [], []), small)
-    assert not rounds.doubtful(Looked([product], [product], [], []), large)
-    quiet = residuals(3, 400)
-    assert not rounds.doubtful(Looked([quiet], [quiet], [], []), small)
+def level_shift(gain: float) -> Found:
+    return Found(effects.LevelShift(), Evidence("level shift", 5.0, 1e-6, gain, 0.1), 1e-5)
+
+
+@pytest.mark.parametrize(
+    ("gain", "product", "step", "doubtful"),
+    [
+        (8.0, 0.3, 0.0, True),  # products explain far more, and all of it
+        (300.0, 0.3, 0.0, False),  # they explain less
+        (8.0, 0.0, 0.0, False),  # they explain nothing
+        (8.0, 0.3, 2.0, False),  # the step is there beside them
+    ],
+)
+def test_an_effect_is_doubtful_where_a_cause_outside_the_catalogue_explains_it(
+    rounds, gain, product, step, doubtful
+):
+    r = residuals(
+        3, 400,
+        effect=lambda t, mean, u: share(u[:, 0] * np.roll(u[:, 0], 6), product)
+        + step * (t > t[200]),
+    )  # fmt: skip
+    beyond = rounds.beyond([r])
+    assert (beyond[0].gain > 0.0) == (product > 0.0)
+    assert rounds.doubtful(level_shift(gain), [r], beyond) == doubtful
+
+
+def test_the_omnibus_test_looks_at_all_that_is_known_without_process_noise(rounds):
+    fit = dgp.fit(MODEL, rounds.data.known[:240], restarts=1, workers=1, progress=False)
+    looked = rounds.look(fit, {"heavy tails"})
+    (whole,), (searched,) = looked.whole, looked.residuals
+    assert whole.held_out.all()
+    assert not searched.held_out.all()
+    assert (whole.mean != searched.mean).any()
