@@ -148,8 +148,11 @@ def confirm(
     else:
         playing, best = better, _best(better)
     equal = [k for k, one in enumerate(playing) if one is best or _ties(one, best)]
-    # Of effects that are one block of the model the most probable one gives it its name.
-    first = {repr(playing[k].tried.model): k for k in reversed(equal)}
+    # Of effects that are one block of the model that which leaves least open gives it its name, if
+    # the residual is certain of it, else the most probable one.
+    first: dict[str, int] = {}
+    for k in sorted(equal, key=lambda k: _specific(better[k].found, level)):
+        first.setdefault(repr(playing[k].tried.model), k)
     chosen = min(
         first.values(), key=lambda k: (better[k].found.effect.freedom, -playing[k].attempt.gain)
     )
@@ -242,6 +245,12 @@ def _first_in_line(better: Sequence[_Judged], level: float) -> list[_Judged]:
     if any(one.found.q_value <= level for one in noise):
         structural = [one for one in structural if one.found.evidence.p_value <= level]
     return structural or noise
+
+
+def _specific(found: Found, level: float) -> tuple[bool, int]:
+    """Certain effects first, and of those the ones that leave less open."""
+    certain = found.q_value <= level
+    return not certain, found.effect.freedom if certain else 0
 
 
 def _best(judged: Sequence[_Judged]) -> _Judged:

@@ -10,17 +10,18 @@ from pyro_dynogp._errors import invalid
 from pyro_dynogp.discrepancy.blocks import blocks_of
 from pyro_dynogp.discrepancy.confirm import Confirmed
 from pyro_dynogp.discrepancy.data_faults import data_spikes
-from pyro_dynogp.discrepancy.effects import CATALOGUE, Effect
+from pyro_dynogp.discrepancy.effects import CATALOGUE, Effect, ProcessNoise
 from pyro_dynogp.discrepancy.evidence import Residuals
 from pyro_dynogp.discrepancy.extend import (
     Model,
     has_function,
+    has_process_noise,
     used_channels,
 )
 from pyro_dynogp.discrepancy.refits import poles_of, quick_fit
 from pyro_dynogp.discrepancy.report import Attempt, Report
 from pyro_dynogp.discrepancy.reporting import report_of
-from pyro_dynogp.discrepancy.rounds import Rounds, Stopwatch
+from pyro_dynogp.discrepancy.rounds import Looked, Rounds, Stopwatch
 from pyro_dynogp.discrepancy.search import Found, candidates_of
 from pyro_dynogp.discrepancy.trials import without
 from pyro_dynogp.discrepancy.words import OUTSIDE
@@ -53,18 +54,20 @@ def close_loop(
 ) -> Report:
     """Say what a fitted model lacks, add it, and report the error before and after.
 
-    Block A is what the model is fitted to, B is searched, C is opened once, at the end. A round
-    first asks whether there is any structure in the residuals at all (an omnibus test, or a false
-    discovery rate of one effect, at half of `level` each); if so, effects whose test rejects at
-    `level`, and their nearest relatives, are added to the model one at a time and fitted to A; the
-    one that raises the log-density of held-out data most is kept if it does so by more than two
-    block standard errors and 4 nats (or, as outliers make both large, with no sample counted for
-    more than 10 nats), effects between inputs and output before those of the noise, which their
-    lack imitates. Of effects that explain as much the one that leaves least open is kept, and
-    the others are reported as ties, and so is a cause that the catalogue lacks, where products of
-    inputs or responses that change with time explain far more. Rounds end where nothing is left, or
-    nothing helps. An effect that no block mends (feedback) is among the report's effects, after
-    those that were added.
+    Block A is what the model is fitted to, B is held out for the search, C is opened once, at the
+    end. Where process noise certainly costs forecasts of B it hides what is missing: the search
+    begins without it, and it comes back as soon as it costs nothing. A round first asks whether
+    there is any structure in the residuals at all (an omnibus test, or a false discovery rate of
+    one effect, at half of `level` each); if so, effects whose test rejects at `level`, and their
+    nearest relatives, are added to the model one at a time and fitted to A; the one that raises
+    the log-density of held-out data most is kept if it does so by more than two block standard
+    errors and 4 nats (or, as outliers make both large, with no sample counted for more than 10
+    nats), effects between inputs and output before those of the noise, which their lack imitates.
+    Of effects that explain as much the one that leaves least open is kept, and the others are
+    reported as ties, and so is a cause that the catalogue lacks, where products of inputs or
+    responses that change with time explain far more. Rounds end where nothing is left, or nothing
+    helps. An effect that no block mends (feedback) is among the report's effects, after those that
+    were added.
 
     Args:
         fit: a fit to one record.
@@ -93,10 +96,14 @@ def close_loop(
     first = quick_fit(
         fit.model, training, seed, None if data.refit else fit.at_mode(), poles=poles_of(fit)
     )
-    current = first
-    watch.stop("fit of block A")
     rounds = Rounds(data, names, seed, level, tries, effects, workers, progress)
-    model: Model = replace(fit.model, scaling=None)
+    current, plain = first, rounds.plain(first)
+    hidden = rounds.hiding(first, plain)
+    waiting: set[str] = set()  # process noise that is taken away until it hides nothing
+    if hidden and has_process_noise(fit.model):
+        current, waiting = plain, {ProcessNoise.name}
+    watch.stop("fit of block A")
+    model: Model = replace(current.model, scaling=None)
     attempts: list[Attempt] = []
     accepted: list[tuple[Found, Confirmed]] = []
     seen: list[Sequence[Residuals]] = []  # before each of them was added
@@ -105,8 +112,8 @@ def close_loop(
     warnings = [fault.sentence for fault in data.faults if fault.channel in channels]
     left: tuple[str, ...] = ()
     for number in range(1, max_rounds + 1):
-        known = {one.effect.name for one, _ in accepted}
-        looked = rounds.look(current, known)
+        known = waiting | {one.effect.name for one, _ in accepted}
+        looked = rounds.look(current, known, plain if number == 1 else None)
         if number == 1:
             warnings += [*_spikes(looked.residuals, data.known), *looked.notes]
         reported = _reported(looked.found, rounds.gate)
@@ -132,26 +139,52 @@ def close_loop(
         if confirmed.fit is not None and not again:
             current = confirmed.fit
         else:
-            training = without(data.known, rounds.held_out)
-            current = quick_fit(model, training, seed, current)
+            current = quick_fit(model, without(data.known, rounds.held_out), seed, current)
+        if waiting and (noisy := rounds.with_process_noise(current)) is not None:
+            current, model, waiting = noisy, replace(noisy.model, scaling=None), set()
         watch.stop("refits")
     else:  # rounds are spent; whether something is left is still to be said
-        looked = rounds.look(current, {one.effect.name for one, _ in accepted})
+        looked = rounds.look(current, waiting | {one.effect.name for one, _ in accepted})
         left = rounds.left(looked)
         reported = _reported(looked.found, rounds.gate)
         watch.stop("residual tests")
     if accepted and left:
-        beyond = rounds.beyond(looked.whole)
-        for k, (winner, confirmed) in enumerate(accepted):
-            if OUTSIDE not in confirmed.ties and rounds.doubtful(winner, seen[k], beyond):
-                confirmed = replace(confirmed, ties=(*confirmed.ties, OUTSIDE))
-                accepted[k] = winner, confirmed
+        accepted = _doubted(accepted, seen, rounds, looked)
         watch.stop("residual tests")
+    if hidden:
+        warnings.append(_hiding(hidden, has_process_noise(fit.model)))
     fits = [first, current] if accepted else [first]
     fitted = _final(fits, data.known, workers, progress)
     base, extended = fitted[0], fitted[-1]
     watch.stop("last fits")
     return report_of(base, extended, rounds, accepted, reported, attempts, warnings, left, watch)
+
+
+def _doubted(
+    accepted: Sequence[tuple[Found, Confirmed]], seen: Sequence[Sequence[Residuals]],
+    rounds: Rounds, last: Looked,
+) -> list[tuple[Found, Confirmed]]:  # fmt: skip
+    """With a cause outside the catalogue as a tie, where what is left at the end explains more.
+
+    Args:
+        accepted: effects. seen: residuals before each of them was added. last: what is left.
+    """
+    beyond = rounds.beyond(last.whole)
+    return [
+        (winner, replace(one, ties=(*one.ties, OUTSIDE)))
+        if OUTSIDE not in one.ties and rounds.doubtful(winner, before, beyond)
+        else (winner, one)
+        for (winner, one), before in zip(accepted, seen, strict=True)
+    ]
+
+
+def _hiding(hidden: str, without_it: bool) -> str:
+    """What to do about process noise that hides what is missing."""
+    went_on = " The search went on without it." if without_it else ""
+    return (
+        f"The model as given {hidden}: such noise can hide what is missing.{went_on} Fit it with "
+        "process_noise=False, and close the loop on that."
+    )
 
 
 def _spikes(residuals: Sequence[Residuals], record: Record) -> list[str]:

@@ -87,20 +87,6 @@ def rated(found: Sequence[tuple[Effect, Evidence]]) -> list[Found]:
     return sorted(both, key=lambda f: (f.evidence.p_value, -f.evidence.gain))
 
 
-def merged(first: Sequence[Found], second: Sequence[Found]) -> list[Found]:
-    """Evidence from two fits: of each effect on each channel the more probable one, paid for."""
-    names = {one.effect.name for one in second}
-    best: dict[tuple[str, str], tuple[Effect, Evidence]] = {}
-    for one in (*first, *second):
-        evidence = one.evidence
-        if one.effect.name in names:
-            evidence = replace(evidence, p_value=min(1.0, 2.0 * evidence.p_value))
-        key = one.effect.name, str(evidence.where.get("channel", ""))
-        if key not in best or evidence.p_value < best[key][1].p_value:
-            best[key] = one.effect, evidence
-    return rated(list(best.values()))
-
-
 def false_discovery_rates(p_values: np.ndarray) -> np.ndarray:
     """Adjusted p-values (m,) of Benjamini and Yekutieli (2001)."""
     m = len(p_values)

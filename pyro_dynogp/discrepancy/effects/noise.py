@@ -63,6 +63,7 @@ class ProcessNoise(Effect):
     score = "one step"
     family = "paths"
     freedom = 6
+    once = True
     test = staticmethod(process_noise)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
