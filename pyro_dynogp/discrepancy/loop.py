@@ -152,7 +152,7 @@ def close_loop(
         accepted = _doubted(accepted, seen, rounds, looked)
         watch.stop("residual tests")
     if hidden:
-        warnings.append(_hiding(hidden, has_process_noise(fit.model)))
+        warnings.append(_hiding(hidden, fit, current, bool(accepted)))
     fits = [first, current] if accepted else [first]
     fitted = _final(fits, data.known, workers, progress)
     base, extended = fitted[0], fitted[-1]
@@ -178,13 +178,17 @@ def _doubted(
     ]
 
 
-def _hiding(hidden: str, without_it: bool) -> str:
-    """What to do about process noise that hides what is missing."""
-    went_on = " The search went on without it." if without_it else ""
-    return (
-        f"The model as given {hidden}: such noise can hide what is missing.{went_on} Fit it with "
-        "process_noise=False, and close the loop on that."
-    )
+def _hiding(hidden: str, given: Fit, current: Fit, added: bool) -> str:
+    """That process noise hides what is missing, and what was done about it."""
+    done = "Fit it with process_noise=False, and close the loop on that."
+    if has_process_noise(given.model) and not added:
+        done = f"The search without it found nothing to add. {done}"
+    elif has_process_noise(given.model):
+        back = has_process_noise(current.model)
+        done = "The search began without it, and the extended model " + (
+            "has it again: there it costs nothing." if back else "does without it."
+        )
+    return f"The model as given {hidden}: such noise can hide what is missing. {done}"
 
 
 def _spikes(residuals: Sequence[Residuals], record: Record) -> list[str]:

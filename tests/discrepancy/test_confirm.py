@@ -14,7 +14,7 @@ import pyro_dynogp as dgp
 from pyro_dynogp.channels import Calendar, Delayed, ShiftedClock
 from pyro_dynogp.discrepancy import effects
 from pyro_dynogp.discrepancy.blocks import shared
-from pyro_dynogp.discrepancy.confirm import _first_in_line, _judge, _Judged, confirm
+from pyro_dynogp.discrepancy.confirm import _first_in_line, _judge, _Judged, _specific, confirm
 from pyro_dynogp.discrepancy.evidence import Evidence
 from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.discrepancy.trials import Tried, interleaved, stretches
@@ -64,6 +64,18 @@ def test_where_noise_alone_is_certain_structure_must_speak_for_itself() -> None:
     lucky, own = (helping(effects.ExtraInput(), p, 0.5) for p in (0.2, 0.01))
     assert names(_first_in_line([lucky, tails], 0.05)) == ["heavy tails"]
     assert names(_first_in_line([own, tails], 0.05)) == ["extra input"]
+
+
+def test_of_effects_that_are_one_block_the_specific_one_gives_the_name_if_it_is_certain() -> None:
+    """Limits of a sensor and a curve at the output are the same function of the model."""
+
+    def leading(q: float) -> str:
+        limits = spoken_for(effects.Saturation(), 1e-3, q)
+        curve = spoken_for(effects.OutputNonlinearity(), 1e-20, 1e-19)
+        return min([curve, limits], key=lambda one: _specific(one, 0.05)).effect.name
+
+    assert leading(0.01) == "saturation"
+    assert leading(0.3) == "output nonlinearity"
 
 
 def judged_noise(gains: np.ndarray, errors: np.ndarray, before: np.ndarray) -> _Judged:

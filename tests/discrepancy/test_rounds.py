@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import pyro_dynogp as dgp
 from pyro_dynogp.discrepancy import effects
 from pyro_dynogp.discrepancy.blocks import blocks_of
 from pyro_dynogp.discrepancy.evidence import Evidence
+from pyro_dynogp.discrepancy.loop import _hiding
 from pyro_dynogp.discrepancy.refits import quick_fit
 from pyro_dynogp.discrepancy.rounds import Looked, Rounds
 from pyro_dynogp.discrepancy.search import Found
@@ -122,7 +124,24 @@ def test_the_search_goes_on_without_process_noise_that_hides_what_is_missing():
         workers=1, progress=False,
     )  # fmt: skip
     assert [one.name for one in report.effects] == ["dead time"]
-    assert sum("went on without it" in one for one in report.warnings) == 1
+    assert sum("the extended model has it again" in one for one in report.warnings) == 1
     assert report.after["rmse"] < 0.05 < report.before["rmse"]  # the noise is 0.02
     assert report.base.model.process_noise
     assert report.fit.model.process_noise  # which is back where it does no harm
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "added", "said"),
+    [
+        (True, False, False, "found nothing to add. Fit it with process_noise=False"),
+        (True, False, True, "the extended model does without it"),
+        (True, True, True, "the extended model has it again"),
+        (False, False, True, "Fit it with process_noise=False"),  # in some layers only
+    ],
+)
+def test_what_was_done_about_noise_that_hides_is_said(before, after, added, said):
+    fits = [
+        SimpleNamespace(model=dataclasses.replace(MODEL, process_noise=noise))
+        for noise in (before, after)
+    ]
+    assert said in _hiding("forecasts better", *fits, added)
