@@ -204,11 +204,13 @@ class Rounds:
         """
         if max(one.gain for one in beyond) <= FAR * winner.evidence.gain:
             return False
+        if winner.effect.score == "one step":  # innovations do not tell what would be left
+            return True
         rest = [
             replace(one, output=one.output - other.fitted)
             for one, other in zip(residuals, beyond, strict=True)
         ]
-        # From the channel it was found in; noise is seen in innovations, which stay as they are.
+        # From the channel it was found in.
         found, _ = look(rest, [winner.effect], seed=self.seed, workers=1)
         channel = winner.evidence.where.get("channel")
         again = [f.evidence for f in found if f.evidence.where.get("channel") == channel]

@@ -106,6 +106,16 @@ def test_an_effect_is_doubtful_where_a_cause_outside_the_catalogue_explains_it(
     assert rounds.doubtful(level_shift(gain), [r], beyond) == doubtful
 
 
+@pytest.mark.parametrize(("gain", "doubtful"), [(8.0, True), (300.0, False)])
+def test_noise_is_doubtful_where_a_cause_outside_the_catalogue_explains_far_more(
+    rounds, gain, doubtful
+):
+    r = residuals(3, 400, effect=lambda t, mean, u: share(u[:, 0] * np.roll(u[:, 0], 6), 0.3))
+    evidence = Evidence("heavy tails", 1.0, 1e-4, gain, 0.1)
+    found = Found(effects.HeavyTails(), evidence, 1e-4)
+    assert rounds.doubtful(found, [r], rounds.beyond([r])) == doubtful
+
+
 def test_the_omnibus_test_looks_at_all_that_is_known_without_process_noise(rounds):
     fit = dgp.fit(MODEL, rounds.data.known[:240], restarts=1, workers=1, progress=False)
     looked = rounds.look(fit, {"heavy tails"})
