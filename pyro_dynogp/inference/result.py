@@ -254,10 +254,10 @@ class Fit:
     def innovations(self, record: Record) -> np.ndarray:
         """Standardised one-step prediction errors (n, n_y); NaN where the output is missing.
 
-        White and standard normal if the model is right.
+        White and standard normal if the model is right: errors over their standard deviation where
+        the prediction is Gaussian, else its normal scores (`Prediction.normal_scores`).
         """
-        prediction = self.predict(record, horizon=1)
-        return (record.outputs - prediction.mean) / prediction.sd
+        return self.predict(record, horizon=1).normal_scores(record.outputs)
 
     def save(self, path: str | Path) -> None:
         """Write the fit to one safetensors file, from which `pyro_dynogp.load` restores it.

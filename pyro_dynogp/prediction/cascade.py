@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp._errors import invalid
+from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.lti.grid import TimeGrid, time_grid
 from pyro_dynogp.models.assembly import Assembly, assemble
 from pyro_dynogp.models.systems import CascadeSystem, DynamicSystem, scaled_inputs, scaled_outputs
@@ -105,24 +106,34 @@ def predict(fit: Fit, record: Record, horizon: int, samples: int, seed: int) -> 
         scale, shift = _units(fit)
         mean = shift + scale * np.stack([one[0] for one in found])
         variance = scale**2 * np.stack([one[1] for one in found])
-        generator = np.random.default_rng(seed)
-        noise = scale**2 * _noise_variance(
-            system, system.noise_sd(inputs, grid), len(mean), generator
-        )
+        sd = _flat(system.noise_sd(inputs, grid))
+    noise = scale**2 * np.broadcast_to(sd, (len(mean), *sd.shape[1:])) ** 2
+    likelihood = system.noise.likelihood
+    shares, multiples = likelihood.components()
     parts = {
         "parameters": mean.var(0),
         "state": variance.mean(0),
-        "measurement noise": noise.mean(0),
+        "measurement noise": float(shares @ multiples) * noise.mean(0),
     }
 
     def draw() -> np.ndarray:
+        generator = np.random.default_rng(seed)
         which = generator.integers(len(mean), size=samples)
-        sd = np.sqrt(variance + noise)
-        return mean[which] + sd[which] * generator.standard_normal((samples, *mean.shape[1:]))
+        drawn = noise[which] * _multiples(likelihood, noise[which].shape, generator)
+        sd = np.sqrt(variance[which] + drawn)
+        return mean[which] + sd * generator.standard_normal(sd.shape)
 
     kind = f"{horizon}-step prediction"
     names = fit.scaling.output_names
-    return Prediction(record.time, names, mean, variance, noise, parts, draw, kind)
+    if likelihood.gaussian:
+        return Prediction(record.time, names, mean, variance, noise, parts, draw, kind)
+    # Each draw of the parameters gives a component for each of the mixture that the noise is.
+    S, K = len(mean), len(shares)
+    return Prediction(
+        record.time, names, np.repeat(mean, K, 0), np.repeat(variance, K, 0),
+        (noise[:, None] * multiples[:, None, None]).reshape(S * K, *noise.shape[1:]),
+        parts, draw, kind, weights=np.tile(shares, S) / S,
+    )  # fmt: skip
 
 
 def _forward(
@@ -229,10 +240,15 @@ def _noise_variance(
     flat = sd.reshape(-1, *sd.shape[-2:]).numpy()
     variance = np.broadcast_to(flat, (len(flat), *flat.shape[1:])) ** 2
     variance = np.tile(variance, (-(-count // len(variance)), 1, 1))[:count]
-    nu = system.noise.likelihood.degrees_of_freedom
-    if nu is not None:
-        variance = variance * (0.5 * nu / generator.standard_gamma(0.5 * nu, variance.shape))
-    return variance
+    return variance * _multiples(system.noise.likelihood, variance.shape, generator)
+
+
+def _multiples(
+    likelihood: Likelihood, shape: tuple[int, ...], generator: np.random.Generator
+) -> np.ndarray | float:
+    """Draws of what multiplies the variance of Gaussian noise: inverse gammas for a Student-t."""
+    nu = likelihood.degrees_of_freedom
+    return 1.0 if nu is None else 0.5 * nu / generator.standard_gamma(0.5 * nu, shape)
 
 
 def _units(fit: Fit) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.special import logsumexp, ndtr, ndtri
+from scipy.special import log_ndtr, logsumexp, ndtr, ndtri, ndtri_exp
 
 from pyro_dynogp._errors import invalid
 
@@ -49,20 +49,21 @@ class Parts(Mapping[str, np.ndarray]):
 class Prediction:
     """Predictive distribution of measured outputs, in the units of the record.
 
-    Given the parameters the outputs are Gaussian; over S posterior draws they are a mixture, of
-    equal weights unless stated, whose moments, quantiles and densities here are exact.
+    Given the parameters the outputs are Gaussian, or a mixture that stands for a Student-t; over
+    posterior draws they are a mixture of S components, of equal weights unless stated, whose
+    moments, quantiles and densities here are exact.
 
     Attributes:
         time: (n,) in the unit of the record.
         output_names: of the n_y outputs.
-        component_mean: (S, n, n_y) mean for each draw.
-        component_variance: (S, n, n_y) variance of the noise-free output for each draw.
-        noise_variance: (S, n_y) variance of the measurement noise for each draw; (S, n, n_y) where
+        component_mean: (S, n, n_y) mean of each component.
+        component_variance: (S, n, n_y) variance of the noise-free output in each component.
+        noise_variance: (S, n_y) variance of the measurement noise in each; (S, n, n_y) where
             it changes over time.
         parts: share of the variance (n, n_y) by cause; they add up to the variance.
         sampler: draws joint samples (S', n, n_y); called once.
         kind: what was predicted, in words.
-        weights: (S,) of the draws; None for equal ones.
+        weights: (S,) of the components; None for equal ones.
     """
 
     time: np.ndarray
@@ -114,7 +115,7 @@ class Prediction:
 
     @cached_property
     def component_sd(self) -> np.ndarray:
-        """(S, n, n_y): standard deviation of measured outputs for each draw."""
+        """(S, n, n_y): standard deviation of measured outputs in each component."""
         noise = self.noise_variance
         return np.sqrt(self.component_variance + (noise if noise.ndim == 3 else noise[:, None, :]))
 
@@ -171,6 +172,26 @@ class Prediction:
     def probability_integral(self, outputs: np.ndarray) -> np.ndarray:
         """Predictive distribution function (n, n_y) at the measured outputs."""
         return self._average(ndtr((outputs - self.component_mean) / self.component_sd))
+
+    def normal_scores(self, outputs: np.ndarray) -> np.ndarray:
+        """Errors (n, n_y) of measured outputs, as quantiles of the standard normal distribution.
+
+        Standard normal if the prediction is right, of whatever shape it is: the normal quantile of
+        `probability_integral`, also far in the tails. NaN where the output is missing.
+
+        Source: randomised quantile residuals of a continuous distribution, Dunn & Smyth, J. Comput.
+        Graph. Stat. 5(3):236 (1996).
+        """
+        z = (outputs - self.component_mean) / self.component_sd
+        if len(z) == 1:
+            return z[0]
+        share = np.log(self.component_weights)[:, None, None]
+        below = logsumexp(log_ndtr(z) + share, axis=0)
+        above = logsumexp(log_ndtr(-z) + share, axis=0)
+        # From the smaller tail: the other one is 1 in floating point far out. Weights add up to
+        # one but for rounding, so either may exceed it.
+        tail = ndtri_exp(np.minimum(np.minimum(below, above), 0.0))
+        return np.where(below < above, tail, -tail)
 
     def to_frame(self) -> pd.DataFrame:
         """Table of mean, sd and the 95 % interval of every output, indexed by time."""

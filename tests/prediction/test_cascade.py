@@ -6,6 +6,7 @@ import numpy as np
 import pyro
 import pytest
 import torch
+from scipy import stats
 from scipy.stats import kurtosis
 
 import pyro_dynogp as dgp
@@ -443,8 +444,32 @@ class TestNoise:
         # Variance nu / (nu - 2) of the squared scale.
         ratio = residuals[1].var() / residuals[0].var()
         assert ratio == pytest.approx(5 / 3, rel=0.15)
-        predicted = heavy.predict(record)
-        assert np.isfinite(predicted.log_density(record.outputs)).all()
+
+    def test_one_step_ahead_student_noise_is_that_and_innovations_are_normal(self):
+        nu = 4.0
+        fit = wiener_fit(
+            initial_state="zero", process_noise=False, noise_sd=2.0, likelihood=dgp.StudentT(nu)
+        )
+        record, _ = wiener_data(fit, n=2000)
+        found = fit.predict(record)
+        scale = 2.0 * fit.scaling.output_scale.item()
+        assert found.signal_sd.max() < 0.1 * scale  # nearly all is noise
+        t = stats.t(nu, found.mean, scale)
+        for q in (0.001, 0.025, 0.3, 0.9, 0.999):
+            expected = t.ppf(q) - found.mean
+            np.testing.assert_allclose(found.quantile(q) - found.mean, expected, rtol=0.05)
+        y = t.rvs(found.mean.shape, random_state=1)
+        assert found.log_density(y).mean() == pytest.approx(t.logpdf(y).mean(), abs=0.01)
+        np.testing.assert_allclose(sum(found.parts.values()), found.variance, rtol=1e-9)
+        # The mixture that stands for a Student-t lacks the end of its tails: 5 % of the variance.
+        assert found.variance.mean() == pytest.approx(nu / (nu - 2) * scale**2, rel=0.06)
+        drawn = (found.samples - found.mean).var()
+        assert drawn == pytest.approx(nu / (nu - 2) * scale**2, rel=0.05)
+        e = fit.innovations(record.with_outputs(y))[:, 0]
+        assert stats.kstest(e, "norm").pvalue > 0.01
+        # Which errors over their standard deviation are not.
+        errors = y - fit.predict(record.with_outputs(y)).mean
+        assert stats.kstest((errors / errors.std())[:, 0], "norm").pvalue < 1e-3
 
 
 def test_steps_record_is_standardised():

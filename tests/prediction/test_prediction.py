@@ -50,6 +50,33 @@ def test_single_component_is_the_normal():
     np.testing.assert_allclose(p.probability_integral(y), stats.norm.cdf(y, p.mean, p.sd))
 
 
+def test_normal_scores_are_normal_quantiles_of_the_distribution_function():
+    p = mixture()
+    y = p.samples[0] + np.linspace(-2.0, 2.0, 7)[:, None]
+    expected = stats.norm.ppf(p.probability_integral(y))
+    np.testing.assert_allclose(p.normal_scores(y), expected, rtol=1e-9, atol=1e-12)
+    assert np.isnan(p.normal_scores(np.full((7, 2), np.nan))).all()
+
+
+def test_normal_scores_far_in_the_tails():
+    same = replace(
+        mixture(draws=3), component_mean=np.zeros((3, 7, 2)), component_variance=np.ones((3, 7, 2)),
+        noise_variance=np.full((3, 2), 3.0), weights=np.array([0.2, 0.5, 0.3]),
+    )  # fmt: skip
+    for z in (-40.0, -3.0, 0.0, 12.0, 40.0):
+        np.testing.assert_allclose(same.normal_scores(2.0 * np.full((7, 2), z)), z, atol=1e-9)
+    # Of two widths the larger one alone reaches far: its tail times its share.
+    wide = replace(
+        same,
+        component_variance=np.array([0.0, 0.0, 3.0])[:, None, None] + 0 * same.component_mean,
+        noise_variance=np.full((3, 2), 1.0),
+    )
+    far = wide.normal_scores(np.full((7, 2), 60.0))
+    np.testing.assert_allclose(
+        stats.norm.logsf(far), np.log(0.3) + stats.norm.logsf(30.0), rtol=1e-6
+    )
+
+
 @pytest.mark.parametrize("q", [0.0, 1.0, -0.1, [0.5, 1.2]])
 def test_quantiles_outside_the_unit_interval(q):
     with pytest.raises(ValueError, match="q: expected probabilities between 0 and 1"):
