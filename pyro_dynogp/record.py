@@ -33,6 +33,7 @@ from pyro_dynogp._record_checks import (
     nanoseconds,
     read_clock,
 )
+from pyro_dynogp.record_writers import columns_of, summary, to_frame, to_xarray
 
 
 @dataclass(frozen=True)
@@ -375,7 +376,7 @@ class Record:
         """
         chosen_u = self.input_names if inputs is None else as_names(inputs)
         chosen_y = self.output_names if outputs is None else as_names(outputs)
-        values, units = self._columns()
+        values, units = columns_of(self)
         for name in (*chosen_u, *chosen_y):
             if name not in values:
                 raise invalid("select", expected=f"names among {list(values)}", got=repr(name))
@@ -437,13 +438,7 @@ class Record:
 
         Units, clock and name go to `frame.attrs`, where `from_frame` finds them again.
         """
-        values, units = self._columns()
-        index = self.timestamps if self.start is not None else pd.Index(self.time)
-        frame = pd.DataFrame(values, index=index).rename_axis("time")
-        frame.attrs = {"units": units, "time_unit": self.time_unit, "name": self.name}
-        if self.start is not None:
-            frame.attrs["start"] = self.start.isoformat()
-        return frame
+        return to_frame(self)
 
     def to_xarray(self) -> xr.Dataset:
         """Dataset of all channels over the dimension "time" [time unit]; units are attributes.
@@ -451,15 +446,7 @@ class Record:
         A record with time stamps has them (UTC) in the coordinate "timestamp", and the instant
         and zone of time zero as attributes "start" and "time_zone" of "time".
         """
-        values, units = self._columns()
-        clock = {"units": self.time_unit}
-        coords: dict[str, Any] = {"time": ("time", self.time, clock)}
-        if self.timestamps is not None and self.start is not None:
-            clock |= {"start": self.start.isoformat(), "time_zone": str(self.start.tz)}
-            utc = self.timestamps.tz_convert("UTC").tz_localize(None)
-            coords["timestamp"] = ("time", utc.to_numpy())
-        channels = {k: ("time", v, {"units": units[k]}) for k, v in values.items()}
-        return xr.Dataset(channels, coords, {"name": self.name})
+        return to_xarray(self)
 
     def __repr__(self) -> str:
         step = f"{self.sampling_time:.6g}" if len(self) > 1 else "none"
@@ -472,26 +459,7 @@ class Record:
 
     def summary(self) -> str:
         """Table of the channels: role, unit, smallest, mean and largest value, gaps."""
-        values, units = self._columns()
-        lines = [repr(self), f"{'channel':<20}{'role':<8}{'unit':<10}"]
-        lines[1] += "".join(f"{head:>12}" for head in ("min", "mean", "max", "missing"))
-        for name, column in values.items():
-            seen = column[~np.isnan(column)]
-            role = "input" if name in self.input_names else "extra"
-            role = "output" if name in self.output_names else role
-            numbers = (seen.min(), seen.mean(), seen.max()) if len(seen) else (np.nan,) * 3
-            cells = "".join(f"{number:>12.5g}" for number in numbers)
-            gaps = len(column) - len(seen)
-            lines.append(f"{name:<20}{role:<8}{units[name] or '-':<10}{cells}{gaps:>12}")
-        return "\n".join(lines)
-
-    def _columns(self) -> tuple[dict[str, Array], dict[str, str]]:
-        """All channels by name, and their units."""
-        values = {name: self.inputs[:, i] for i, name in enumerate(self.input_names)}
-        values |= {name: self.outputs[:, i] for i, name in enumerate(self.output_names)}
-        units = dict(zip(self.input_names, self.input_units, strict=True))
-        units |= dict(zip(self.output_names, self.output_units, strict=True))
-        return values | dict(self.extra), units | dict(self.extra_units)
+        return summary(self)
 
 
 def as_records(records: Record | Sequence[Record]) -> tuple[Record, ...]:
