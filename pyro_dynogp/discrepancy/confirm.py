@@ -234,17 +234,17 @@ def _first_in_line(better: Sequence[_Judged], level: float) -> list[_Judged]:
 
     With eight candidates one improves on held-out data by luck, and flexible ones take up much of
     what others should. Where the residual is certain of an effect (by its false discovery rate)
-    only that and its relatives count, of structure; where it is certain of noise alone, structure
-    whose own test rejects.
+    only that and its relatives count, of structure; where it is certain of noise alone, noise comes
+    first: what structure there may be is seen better beside the noise that there is.
     """
     structural = [one for one in better if one.kind[1] == "forecast"]
     certain = {one.found.effect.family for one in structural if one.found.q_value <= level}
     if certain:
         return [one for one in structural if one.found.effect.family in certain]
     noise = [one for one in better if one.kind[1] != "forecast"]
-    if any(one.found.q_value <= level for one in noise):
-        structural = [one for one in structural if one.found.evidence.p_value <= level]
-    return structural or noise
+    if not structural or any(one.found.q_value <= level for one in noise):
+        return noise
+    return structural
 
 
 def _specific(found: Found, level: float) -> tuple[bool, int]:
