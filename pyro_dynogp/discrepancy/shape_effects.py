@@ -101,10 +101,11 @@ def dead_zone(residuals: Residuals, *, seed: int = 0) -> Evidence:
 
     The column is the model's own path from that input, driven by dead zone less input. `where`:
     channel, low, high [input]; the smallest or largest value of the input where the zone reaches
-    that far.
+    that far. An input of two values has no such zone.
 
     Raises:
-        ValueError: where fewer than 30 samples are held out and measured.
+        ValueError: where fewer than 30 samples are held out and measured, or no input has a third
+            value.
     """
     r = residuals
     path = paths(r)
@@ -118,8 +119,15 @@ def dead_zone(residuals: Residuals, *, seed: int = 0) -> Evidence:
     for j, u in enumerate(r.inputs.T):
         at = np.unique(np.quantile(u, LEVELS))
         inner = [(a, b) for i, a in enumerate(at) for b in at[i + 1 :] if (a, b) != (at[0], at[-1])]
+        if not inner:
+            continue
         tried += [(j, float(a), float(b)) for a, b in inner]
         variants += [with_past(c) for c in columns(j, inner).T]
+    if not variants:
+        raise ValueError(
+            "residuals: expected an input of more than two values, among which a dead zone could "
+            f"lie; none of the {r.inputs.shape[1]} has a third."
+        )
     found = of_positive_weight(lasting(r, variants, nuisance, seed))
     j, low, high = tried[found.best]
     if found.p_value < NOTICED:

@@ -119,6 +119,18 @@ def test_dead_zone_of_one_channel(low, high):
     assert found.where["high"] == pytest.approx(high, abs=0.2)
 
 
+def test_an_input_of_two_values_has_no_dead_zone_but_others_may():
+    u, _, b, e = scene(6, noise=0.05)
+    switch = (u[:, 0] > 0.0).astype(float)
+    path = lag(switch, 0.5)
+    y = path + lag(signals.dead_zone(u[:, 1], -0.5, 0.4), 0.8) + e
+    found = dead_zone(residuals_of(y, path + 0.7 * b, np.column_stack([switch, u[:, 1]])))
+    assert found.p_value < 1e-3
+    assert found.where["channel"] == "v"
+    with pytest.raises(ValueError, match="expected an input of more than two values"):
+        dead_zone(residuals_of(path + e, path, np.column_stack([switch, switch])))
+
+
 def test_an_input_that_saturates_has_no_dead_zone():
     u, a, b, e = scene(7, noise=0.05)
     r = residuals_of(a + lag(np.clip(u[:, 1], -0.7, 0.7), 0.8) + e, a + 0.7 * b, u)
