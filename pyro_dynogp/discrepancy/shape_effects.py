@@ -101,11 +101,11 @@ def dead_zone(residuals: Residuals, *, seed: int = 0) -> Evidence:
 
     The column is the model's own path from that input, driven by dead zone less input. `where`:
     channel, low, high [input]; the smallest or largest value of the input where the zone reaches
-    that far. An input of two values has no such zone.
+    that far. An input with less than three values among its octiles is left out.
 
     Raises:
-        ValueError: where fewer than 30 samples are held out and measured, or no input has a third
-            value.
+        ValueError: where fewer than 30 samples are held out and measured, or all inputs are left
+            out.
     """
     r = residuals
     path = paths(r)
@@ -125,8 +125,8 @@ def dead_zone(residuals: Residuals, *, seed: int = 0) -> Evidence:
         variants += [with_past(c) for c in columns(j, inner).T]
     if not variants:
         raise ValueError(
-            "residuals: expected an input of more than two values, among which a dead zone could "
-            f"lie; none of the {r.inputs.shape[1]} has a third."
+            "residuals: expected an input of more than two values among its octiles, between which "
+            f"a dead zone could lie; none of the {r.inputs.shape[1]} has them."
         )
     found = of_positive_weight(lasting(r, variants, nuisance, seed))
     j, low, high = tried[found.best]

@@ -60,9 +60,10 @@ def test_only_relatives_stand_beside_a_certain_cause() -> None:
 
 
 def test_where_noise_alone_is_certain_it_comes_before_structure() -> None:
-    own = helping(effects.ExtraInput(), 0.01, 0.5)
+    lucky, own = (helping(effects.ExtraInput(), p, 0.5) for p in (0.2, 0.01))
     for q, first in ((1e-8, "heavy tails"), (0.2, "extra input")):
         tails = helping(effects.HeavyTails(), 1e-9, q)
+        assert names(_first_in_line([lucky, tails], 0.05)) == [first]
         assert names(_first_in_line([own, tails], 0.05)) == [first]
 
 
