@@ -4,27 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pyro_dynogp._errors import invalid
 from pyro_dynogp.discrepancy.blocks import blocks_of
-from pyro_dynogp.discrepancy.confirm import Confirmed
-from pyro_dynogp.discrepancy.data_faults import data_spikes
-from pyro_dynogp.discrepancy.effects import CATALOGUE, Effect, ProcessNoise
-from pyro_dynogp.discrepancy.evidence import Residuals
-from pyro_dynogp.discrepancy.extend import (
-    Model,
-    has_function,
-    has_process_noise,
-    used_channels,
-)
+from pyro_dynogp.discrepancy.course import Course
+from pyro_dynogp.discrepancy.effects import CATALOGUE, Effect
+from pyro_dynogp.discrepancy.extend import has_function, used_channels
 from pyro_dynogp.discrepancy.refits import poles_of, quick_fit
-from pyro_dynogp.discrepancy.report import Attempt, Report
+from pyro_dynogp.discrepancy.report import Report
 from pyro_dynogp.discrepancy.reporting import report_of
-from pyro_dynogp.discrepancy.rounds import Looked, Rounds, Stopwatch
-from pyro_dynogp.discrepancy.search import Found, candidates_of
+from pyro_dynogp.discrepancy.rounds import Rounds, Stopwatch
 from pyro_dynogp.discrepancy.trials import without
-from pyro_dynogp.discrepancy.words import OUTSIDE
 from pyro_dynogp.inference.fit import fit as fit_model
 from pyro_dynogp.inference.result import Method
 from pyro_dynogp.models.cascade import Cascade
@@ -56,18 +47,18 @@ def close_loop(
 
     Block A is what the model is fitted to, B is held out for the search, C is opened once, at the
     end. Where process noise certainly costs forecasts of B it hides what is missing: the search
-    begins without it, and it comes back as soon as it costs nothing. A round first asks whether
-    there is any structure in the residuals at all (an omnibus test, or a false discovery rate of
-    one effect, at half of `level` each); if so, effects whose test rejects at `level`, and their
-    nearest relatives, are added to the model one at a time and fitted to A; the one that raises
-    the log-density of held-out data most is kept if it does so by more than two block standard
-    errors and 4 nats (or, as outliers make both large, with no sample counted for more than 10
-    nats), effects between inputs and output before those of the noise, which their lack imitates.
-    Of effects that explain as much the one that leaves least open is kept, and the others are
-    reported as ties, and so is a cause that the catalogue lacks, where products of inputs or
-    responses that change with time explain far more. Rounds end where nothing is left, or nothing
-    helps. An effect that no block mends (feedback) is among the report's effects, after those that
-    were added.
+    begins without it, and it comes back as soon as it costs nothing, or where nothing can be added
+    without it (`Course`). A round first asks whether there is any structure in the residuals at all
+    (an omnibus test, or a false discovery rate of one effect, at half of `level` each); if so,
+    effects whose test rejects at `level`, and their nearest relatives, are added to the model one
+    at a time and fitted to A; the one that raises the log-density of held-out data most is kept if
+    it does so by more than two block standard errors and 4 nats (or, as outliers make both large,
+    with no sample counted for more than 10 nats), effects between inputs and output before those of
+    the noise, which their lack imitates. Of effects that explain as much the one that leaves least
+    open is kept, and the others are reported as ties, and so is a cause that the catalogue lacks,
+    where products of inputs or responses that change with time explain far more. Rounds end where
+    nothing is left, or nothing helps. An effect that no block mends (feedback) is among the
+    report's effects, after those that were added.
 
     Args:
         fit: a fit to one record.
@@ -91,110 +82,26 @@ def close_loop(
     other = candidates if isinstance(candidates, Record) else None
     data = blocks_of(fit, record, other)
     names = _names(fit, data.known, candidates)
-    training = without(data.known, data.held_out)
     # As far up as its extensions will get: what a better climb gains is no effect.
     first = quick_fit(
-        fit.model, training, seed, None if data.refit else fit.at_mode(), poles=poles_of(fit)
-    )
+        fit.model, without(data.known, data.held_out), seed, None if data.refit else fit.at_mode(),
+        poles=poles_of(fit),
+    )  # fmt: skip
     rounds = Rounds(data, names, seed, level, tries, effects, workers, progress)
-    current, plain = first, rounds.plain(first)
-    hidden = rounds.hiding(first, plain)
-    waiting: set[str] = set()  # process noise that is taken away until it hides nothing
-    if hidden and has_process_noise(fit.model):
-        current, waiting = plain, {ProcessNoise.name}
+    course = Course(rounds, watch, first)
     watch.stop("fit of block A")
-    model: Model = replace(current.model, scaling=None)
-    attempts: list[Attempt] = []
-    accepted: list[tuple[Found, Confirmed]] = []
-    seen: list[Sequence[Residuals]] = []  # before each of them was added
-    reported: list[Found] = []
+    while course.go_round():
+        if len(course.accepted) == max_rounds:  # whether something is left is still to be said
+            course.look()
+            break
+    course.doubt()
     channels = ("", *data.known.output_names, *names)
     warnings = [fault.sentence for fault in data.faults if fault.channel in channels]
-    left: tuple[str, ...] = ()
-    for number in range(1, max_rounds + 1):
-        known = waiting | {one.effect.name for one, _ in accepted}
-        looked = rounds.look(current, known, plain if number == 1 else None)
-        if number == 1:
-            warnings += [*_spikes(looked.residuals, data.known), *looked.notes]
-        reported = _reported(looked.found, rounds.gate)
-        left = rounds.left(looked)
-        watch.stop("residual tests")
-        chosen = candidates_of(looked.found, model, data.known, level, tries) if left else []
-        attempts += _untried(looked.found, chosen, level, number)
-        if not chosen:
-            break
-        confirmed = rounds.confirm(chosen, current, number)
-        watch.stop("refits")
-        attempts += confirmed.attempts
-        winner, larger = confirmed.winner, confirmed.model
-        if winner is None or larger is None:
-            break
-        if rounds.doubtful(winner, looked.whole, rounds.beyond(looked.residuals)):
-            confirmed = replace(confirmed, ties=(*confirmed.ties, OUTSIDE))
-        accepted.append((winner, confirmed))
-        seen.append(looked.whole)
-        watch.stop("residual tests")
-        model = larger
-        again = rounds.hold_out_less(winner)
-        if confirmed.fit is not None and not again:
-            current = confirmed.fit
-        else:
-            current = quick_fit(model, without(data.known, rounds.held_out), seed, current)
-        if waiting and (noisy := rounds.with_process_noise(current)) is not None:
-            current, model, waiting = noisy, replace(noisy.model, scaling=None), set()
-        watch.stop("refits")
-    else:  # rounds are spent; whether something is left is still to be said
-        looked = rounds.look(current, waiting | {one.effect.name for one, _ in accepted})
-        left = rounds.left(looked)
-        reported = _reported(looked.found, rounds.gate)
-        watch.stop("residual tests")
-    if accepted and left:
-        accepted = _doubted(accepted, seen, rounds, looked)
-        watch.stop("residual tests")
-    if hidden:
-        warnings.append(_hiding(hidden, fit, current, bool(accepted)))
-    fits = [first, current] if accepted else [first]
+    warnings += [*course.notes, *course.said_of_hiding()]
+    fits = [first, course.current] if course.accepted else [first]
     fitted = _final(fits, data.known, workers, progress)
-    base, extended = fitted[0], fitted[-1]
     watch.stop("last fits")
-    return report_of(base, extended, rounds, accepted, reported, attempts, warnings, left, watch)
-
-
-def _doubted(
-    accepted: Sequence[tuple[Found, Confirmed]], seen: Sequence[Sequence[Residuals]],
-    rounds: Rounds, last: Looked,
-) -> list[tuple[Found, Confirmed]]:  # fmt: skip
-    """With a cause outside the catalogue as a tie, where what is left at the end explains more.
-
-    Args:
-        accepted: effects. seen: residuals before each of them was added. last: what is left.
-    """
-    beyond = rounds.beyond(last.whole)
-    return [
-        (winner, replace(one, ties=(*one.ties, OUTSIDE)))
-        if OUTSIDE not in one.ties and rounds.doubtful(winner, before, beyond)
-        else (winner, one)
-        for (winner, one), before in zip(accepted, seen, strict=True)
-    ]
-
-
-def _hiding(hidden: str, given: Fit, current: Fit, added: bool) -> str:
-    """That process noise hides what is missing, and what was done about it."""
-    done = "Fit it with process_noise=False, and close the loop on that."
-    if has_process_noise(given.model) and not added:
-        done = f"The search without it found nothing to add. {done}"
-    elif has_process_noise(given.model):
-        back = has_process_noise(current.model)
-        done = "The search began without it, and the extended model " + (
-            "has it again: there it costs nothing." if back else "does without it."
-        )
-    return f"The model as given {hidden}: such noise can hide what is missing. {done}"
-
-
-def _spikes(residuals: Sequence[Residuals], record: Record) -> list[str]:
-    """Spikes of the outputs, in words, also in samples that tests leave out."""
-    whole = [replace(one, output=record.outputs[:, a]) for a, one in enumerate(residuals)]
-    return [fault.sentence for one in whole if (fault := data_spikes(one)) is not None]
+    return report_of(fitted[0], fitted[-1], course, warnings)
 
 
 def _names(fit: Fit, record: Record, candidates: Sequence[str] | Record | None) -> list[str]:
@@ -213,28 +120,6 @@ def _names(fit: Fit, record: Record, candidates: Sequence[str] | Record | None) 
                 "candidates", expected=f"extra channels {list(record.extra)}", got=f"{unknown}"
             )
     return sorted(set(names) - used_channels(fit.model))
-
-
-def _reported(found: Sequence[Found], level: float) -> list[Found]:
-    """What no block mends. Of the last tests: what a model lacks may look like feedback, too."""
-    return [f for f in found if not f.effect.added and f.q_value <= level]
-
-
-def _untried(
-    found: Sequence[Found], chosen: Sequence[tuple[Found, Any]], level: float, number: int
-) -> list[Attempt]:
-    """Effects that the residual speaks for, but that were not refitted."""
-    tried = [one for one, _ in chosen]
-    return [
-        Attempt(
-            number, f.evidence, f.q_value,
-            "not tried" if f.effect.added else "reported",
-            "others are more probable, or no block of the model stands for it" if f.effect.added
-            else "is reported, not added",
-        )
-        for f in found
-        if f.q_value <= level and not any(f is one for one in tried)
-    ]  # fmt: skip
 
 
 def _final(fits: Sequence[Fit], record: Record, workers: int | None, progress: bool) -> list[Fit]:

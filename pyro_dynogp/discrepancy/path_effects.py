@@ -52,7 +52,9 @@ def extra_input(residuals: Residuals, *, seed: int = 0) -> list[Evidence]:
 def _forms(residuals: Residuals, name: str) -> dict[str, np.ndarray]:
     w = standardised(held(residuals.candidates[name])[:, None])[:, 0]
     u = standardised(residuals.inputs)
-    forms = {"linear": w, "square": w**2, "absolute": np.abs(w)}
+    forms = {"linear": w}
+    if len(np.unique(w)) > 2:  # of a flag square and absolute value are the flag again
+        forms |= {"square": w**2, "absolute": np.abs(w)}
     for j, used in enumerate(residuals.input_names):
         forms[f"product with {used}"] = w * u[:, j]
     return forms

@@ -10,11 +10,12 @@ import numpy as np
 from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.discrepancy import words
 from pyro_dynogp.discrepancy.confirm import Confirmed
+from pyro_dynogp.discrepancy.course import Course
 from pyro_dynogp.discrepancy.effects import Effect
 from pyro_dynogp.discrepancy.evidence import Residuals
 from pyro_dynogp.discrepancy.parameters import limits_of, parameters_of
-from pyro_dynogp.discrepancy.report import Attempt, FoundEffect, Report
-from pyro_dynogp.discrepancy.rounds import Rounds, Stopwatch
+from pyro_dynogp.discrepancy.report import FoundEffect, Report
+from pyro_dynogp.discrepancy.rounds import Rounds
 from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.discrepancy.trials import one_step_density
 from pyro_dynogp.parallel import parallel_map
@@ -31,18 +32,14 @@ SLACK = 1.05
 SCORES = ("rmse", "mae", "nrmse", "crps", "coverage_50", "coverage_95")
 
 
-def report_of(
-    base: Fit,
-    extended: Fit,
-    rounds: Rounds,
-    accepted: Sequence[tuple[Found, Confirmed]],
-    reported: Sequence[Found],
-    attempts: Sequence[Attempt],
-    warnings: Sequence[str],
-    left: tuple[str, ...],
-    watch: Stopwatch,
-) -> Report:
-    """Open block C, once."""
+def report_of(base: Fit, extended: Fit, course: Course, warnings: Sequence[str]) -> Report:
+    """Open block C, once.
+
+    Args:
+        base, extended: last fits of the model as given and with what was added.
+        course: what the rounds came to. warnings: what else is to be known.
+    """
+    rounds, watch, accepted = course.rounds, course.watch, course.accepted
     data = rounds.data
     forecasts = [
         one.forecast(data.known, data.sealed, seed=rounds.seed) for one in (base, extended)
@@ -63,16 +60,16 @@ def report_of(
     effects = [_effect(f, c, extended, data.known) for f, c in accepted]
     watch.stop("numbers of the effects")
     return Report(
-        effects=(*effects, *(_only_reported(f) for f in reported)),
-        outcome=_outcome(bool(accepted), bool(left)),
+        effects=(*effects, *(_only_reported(f) for f in course.reported)),
+        outcome=_outcome(bool(accepted), bool(course.left)),
         before=before,
         after=after,
         elpd_gain=elpd_gain,
         elpd_gain_error=elpd_gain_error,
         fit=extended,
         base=base,
-        attempts=tuple(attempts),
-        left=left,
+        attempts=tuple(course.attempts),
+        left=course.left,
         warnings=(*warnings, *unpaid),
         data=data.sentence,
         tests=tests,

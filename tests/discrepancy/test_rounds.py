@@ -12,8 +12,8 @@ from scipy.signal import lfilter
 import pyro_dynogp as dgp
 from pyro_dynogp.discrepancy import effects
 from pyro_dynogp.discrepancy.blocks import blocks_of
+from pyro_dynogp.discrepancy.course import Course
 from pyro_dynogp.discrepancy.evidence import Evidence
-from pyro_dynogp.discrepancy.loop import _hiding
 from pyro_dynogp.discrepancy.refits import quick_fit
 from pyro_dynogp.discrepancy.rounds import Looked, Rounds
 from pyro_dynogp.discrepancy.search import Found
@@ -140,18 +140,60 @@ def test_the_search_goes_on_without_process_noise_that_hides_what_is_missing():
     assert report.fit.model.process_noise  # which is back where it does no harm
 
 
+class OnlyBesideNoise(effects.LevelShift):
+    """A step that cannot be added to a model without process noise."""
+
+    def extend(self, model, evidence, record):
+        return super().extend(model, evidence, record) if model.process_noise else []
+
+
 @pytest.mark.parametrize(
-    ("before", "after", "added", "said"),
+    ("effect", "said"),
     [
-        (True, False, False, "found nothing to add. Fit it with process_noise=False"),
-        (True, False, True, "the extended model does without it"),
-        (True, True, True, "the extended model has it again"),
-        (False, False, True, "Fit it with process_noise=False"),  # in some layers only
+        (effects.LevelShift, "The search began without it"),
+        (OnlyBesideNoise, "found nothing to add, and began again with it"),
     ],
 )
-def test_what_was_done_about_noise_that_hides_is_said(before, after, added, said):
-    fits = [
-        SimpleNamespace(model=dataclasses.replace(MODEL, process_noise=noise))
-        for noise in (before, after)
-    ]
-    assert said in _hiding("forecasts better", *fits, added)
+def test_where_nothing_can_be_added_without_process_noise_the_search_begins_again_with_it(
+    monkeypatch, effect, said
+):
+    monkeypatch.setattr(Rounds, "hiding", lambda self, fit, plain: "" if fit is plain else "hides")
+    record = oscillator(0, 0.3, seed=3)
+    y = record.outputs[:, 0] + 2.0 * (np.arange(N) >= 270)
+    record = record.with_outputs(y)
+    fit = dgp.fit(MODEL, record[:240], restarts=1, workers=1, progress=False)
+    report = dgp.close_loop(
+        fit, record, effects=(effect(),), max_rounds=1, workers=1, progress=False
+    )
+    assert [one.name for one in report.effects] == ["level shift"]
+    assert report.after["rmse"] < 0.7 * report.before["rmse"]
+    assert sum(said in one for one in report.warnings) == 1
+    again = effect is OnlyBesideNoise
+    assert report.fit.model.process_noise == again
+    assert {one.round for one in report.attempts if one.decision == "accepted"} == {1 + again}
+
+
+@pytest.mark.parametrize(
+    ("noise", "accepted", "returned", "said"),
+    [
+        ((True, False), True, False, "the extended model does without it"),
+        ((True, True), True, False, "the extended model has it again"),
+        ((True, True), True, True, "found nothing to add, and began again with it"),
+        ((True, True), False, True, "Neither without it nor with it"),
+        ((True, False), False, False, "Without it nothing is missing"),
+        ((False, False), True, False, "Fit it with process_noise=False"),  # in some layers only
+    ],
+)
+def test_what_was_done_about_noise_that_hides_is_said(noise, accepted, returned, said):
+    first, current = (
+        SimpleNamespace(model=dataclasses.replace(MODEL, process_noise=one)) for one in noise
+    )
+    course = SimpleNamespace(
+        hidden="forecasts better", first=first, current=current, accepted=accepted,
+        returned=returned,
+    )  # fmt: skip
+    (sentence,) = Course.said_of_hiding(course)
+    assert sentence.startswith("The model as given forecasts better")
+    assert said in sentence
+    course.hidden = ""
+    assert Course.said_of_hiding(course) == []
