@@ -23,6 +23,8 @@ DAYS_FOR_HOURS, DAYS_FOR_WEEK, DAYS_FOR_YEAR = 3, 14, 548
 WEEKDAYS = ("Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun")
 TURN = ("20 Dec", "24 Dec", "28 Dec", "1 Jan", "5 Jan", "9 Jan", "13 Jan")
 SEASONS = ("Dec-Feb", "Mar-May", "Jun-Aug", "Sep-Nov")
+# Contrasts of the year; the others are of the day and the week.
+YEARLY = ("season", "time of year", "turn of the year")
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +45,7 @@ class Contrast:
     labels: tuple[str, ...]
 
 
-def calendar(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 0) -> Evidence:
+def calendar(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 0) -> list[Evidence]:
     """A level that depends on the calendar, beside what the inputs explain; all samples.
 
     Weeks and years are long: what was fitted to is looked at, too. A fit can take part of a
@@ -51,7 +53,8 @@ def calendar(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 0) 
 
     Group averages are free for hour of day (24), weekday (7), weekend (2), hour by weekend (48),
     season (4); time of year is two harmonics of a year, the turn of the year seven hats four days
-    apart around the first of January. One statistic for all and for all zones.
+    apart around the first of January. One statistic for all of the day and the week and for all
+    zones, and one for all of the year: what repeats every day must not hide what does once a year.
 
     Args:
         residuals: of one output (n,), with stamps.
@@ -59,9 +62,10 @@ def calendar(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 0) 
         seed: of the replicates.
 
     Returns:
-        where: what ("hour of day", "weekday", "weekend", "hour of day by weekday/weekend",
-        "season", "time of year", "turn of the year"), zone (that of the stamps where clocks
-        cannot be told apart).
+        One piece of evidence of the day and the week; another one of the year where the record is
+        long enough. where: what ("hour of day", "weekday", "weekend", "hour of day by
+        weekday/weekend"; "season", "time of year", "turn of the year"), zone (that of the stamps
+        where clocks cannot be told apart).
 
     Raises:
         ValueError: where there are no stamps, a zone is unknown, the record is shorter than three
@@ -69,19 +73,32 @@ def calendar(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 0) 
 
     Source: F test of group contrasts in the whitened residual; its null by `sieve`.
     """
-    r = residuals
-    x = r.residual
-    contrasts, columns = _contrasts(r, zones, np.isfinite(x))
-    variants = [np.array(c.columns) for c in contrasts]
+    contrasts, columns = _contrasts(residuals, zones, np.isfinite(residuals.residual))
+    of_year = [c for c in contrasts if c.what in YEARLY]
+    others = [c for c in contrasts if c.what not in YEARLY]
     # One clock is enough to take the calendar's lines out of the noise's filter.
-    own_clock = sorted({k for c in contrasts if c.zone == contrasts[0].zone for k in c.columns})
-    few = len(own_clock) < np.isfinite(x).sum() // 5
+    lines = sorted({k for c in contrasts if c.zone == contrasts[0].zone for k in c.columns})
+    return [_best_of(residuals, some, columns, lines, seed) for some in (others, of_year) if some]
+
+
+def _best_of(
+    r: Residuals, contrasts: Sequence[Contrast], columns: np.ndarray, lines: list[int], seed: int
+) -> Evidence:
+    """Evidence of the contrast that explains most.
+
+    Args:
+        contrasts: that are tried. columns: (n, M) of all clocks.
+        lines: those that are taken out of the noise's filter.
+    """
+    x = r.residual
+    variants = [np.array(c.columns) for c in contrasts]
+    few = len(lines) < np.isfinite(x).sum() // 5
     found = sieve(
         x,
         columns_score(columns, variants, spanning(own(r)), ~np.isfinite(x)),
         np.array([c.degrees for c in contrasts]),
         deviations=r.deviations,
-        first=columns[:, own_clock] if few else None,
+        first=columns[:, lines] if few else None,
         replicates=replicates(len(r), columns.shape[1]),
         seed=seed,
     )

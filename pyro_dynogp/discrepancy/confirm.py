@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -151,7 +151,9 @@ def confirm(
     # Of effects that are one block of the model that which leaves least open gives it its name, if
     # the residual is certain of it, else the most probable one.
     first: dict[str, int] = {}
-    for k in sorted(equal, key=lambda k: _specific(better[k].found, level)):
+    well = {better[k].found.effect.name for k in equal}
+    named = [k for k in equal if not _too_special(better[k].found, well, level)]
+    for k in sorted(named, key=lambda k: _specific(better[k].found, level)):
         first.setdefault(repr(playing[k].tried.model), k)
     chosen = min(
         first.values(), key=lambda k: (better[k].found.effect.freedom, -playing[k].attempt.gain)
@@ -251,6 +253,11 @@ def _specific(found: Found, level: float) -> tuple[bool, int]:
     """Certain effects first, and of those the ones that leave less open."""
     certain = found.q_value <= level
     return not certain, found.effect.freedom if certain else 0
+
+
+def _too_special(one: Found, names: Collection[str], level: float) -> bool:
+    """Whether it is a special case, of which the residual is not certain, of what does as well."""
+    return one.effect.special_of in names and one.q_value > level
 
 
 def _best(judged: Sequence[_Judged]) -> _Judged:

@@ -101,12 +101,18 @@ def as_cascade(model: Model) -> Cascade:
     )
 
 
-def with_output_function(model: Model) -> Model | None:
-    """The model with a static layer after its last dynamic one; None where there is one already."""
+def with_output_function(
+    model: Model, limits: tuple[float | None, float | None] | None = None
+) -> Model | None:
+    """The model with a static layer after its last dynamic one; None where there is one already.
+
+    Its prior mean is a straight line, to which it goes back beyond the data; or one that stops at
+    limits [output].
+    """
     cascade = as_cascade(model)
     if isinstance(cascade.layers[-1], Static):
         return None
-    last = Static(outputs=cascade.outputs, inducing=INDUCING)
+    last = Static(outputs=cascade.outputs, inducing=INDUCING, mean="linear", limits=limits)
     return replace(cascade, layers=(*cascade.layers, last), scaling=None)
 
 

@@ -62,7 +62,9 @@ def describe(model: Model) -> tuple[str, ...]:
             plural = "s" if layer.pairs != 1 else ""
             lines.append(f"linear dynamics, {layer.pairs} pair{plural} of poles, {noise}")
         else:
-            lines.append(f"static function, {layer.inducing} inducing values")
+            limits = [f"{at:.4g}" for at in layer.limits or () if at is not None]
+            stops = f", stops at {' and '.join(limits)}" if limits else ""
+            lines.append(f"static function, {layer.inducing} inducing values{stops}")
     lines += [f"plus {in_words(one)}" for one in direct]
     plain = model.direct - sum(len(one.names) for one in direct)
     if plain:

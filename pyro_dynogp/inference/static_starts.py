@@ -65,6 +65,7 @@ def start_static(
         u = line[0] * u + line[1].unsqueeze(-1)
     if curve is not None and d == 1:
         u = torch.stack([_smooth_means(x[:, 0], curve[:, o], Z[:, 0]) for o in range(e)])
+    u = u.clamp(*function.limits)
     values[f"{name}_values"] = _whiten(function, u)
     function = _function(model, one, layer, values)
     with torch.no_grad():

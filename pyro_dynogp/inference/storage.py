@@ -166,7 +166,8 @@ def _layer(options: Mapping[str, Any]) -> Layer:
     kind = given.pop("kind")
     if kind not in LAYERS:
         raise ValueError(f"load: unknown layer {kind!r}; known are {sorted(LAYERS)}.")
-    return LAYERS[kind](**{**given, "skip": tuple(given["skip"])})
+    given |= {name: tuple(v) for name, v in given.items() if isinstance(v, list)}
+    return LAYERS[kind](**given)
 
 
 def _restore(kind: type[Fit], header: dict[str, Any], tensors: dict[str, Any]) -> Fit:

@@ -12,6 +12,7 @@ The outputs of a layer share kernel and locations and are independent given them
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -27,6 +28,7 @@ from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
 # second where the first does not suffice. Coincident locations need it: K_zz is then singular.
 JITTER = 1e-8
 LARGER_JITTER = 1e-6
+UNLIMITED = (-math.inf, math.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +47,7 @@ class StaticFunction:
         constant: (*b, e), constant part of the prior mean.
         slope: (*b, e, d), slopes of the prior mean; None for a constant mean.
         name: what error messages call it.
+        limits: where the prior mean stops, below and above; infinite where it does not.
 
     Raises:
         ValueError: if shapes do not fit together, or points have another number of channels.
@@ -58,6 +61,7 @@ class StaticFunction:
     constant: Tensor
     slope: Tensor | None = None
     name: str = "static function"
+    limits: tuple[float, float] = UNLIMITED
 
     def __post_init__(self) -> None:
         e, (M, d) = self.outputs, self.locations.shape[-2:]
@@ -107,10 +111,10 @@ class StaticFunction:
     def prior_mean(self, x: Tensor) -> Tensor:
         """Prior mean mu (*b, n, e) at points x (*b, n, d)."""
         self._check_points("x", x)
-        constant = self.constant.unsqueeze(-2)
+        mean = self.constant.unsqueeze(-2) + x.new_zeros((x.shape[-2], 1))
         if self.slope is not None:
-            return constant + x @ self.slope.mT
-        return constant + x.new_zeros((x.shape[-2], 1))
+            mean = mean + x @ self.slope.mT
+        return mean if self.limits == UNLIMITED else mean.clamp(*self.limits)
 
     def mean(self, x: Tensor) -> Tensor:
         """Conditional mean E[f(x) | v] (*b, n, e) at points x (*b, n, d)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
@@ -171,7 +172,7 @@ class Cascade:
             if isinstance(one.layer, Dynamic):
                 systems.append(self.sample_dynamic_layer(one, one.layer, time_scale))
             else:
-                systems.append(self._sample_static(one, one.layer))
+                systems.append(self._sample_static(one, one.layer, scaling))
         flat = self.priors == "paper"
         offset = None
         if isinstance(self.layers[-1], Dynamic):
@@ -205,9 +206,9 @@ class Cascade:
     ) -> StaticFunction:
         """The function of a static layer given values of its sites; no trace sees it."""
         with pyro.poutine.block(), pyro.poutine.condition(data=dict(values)):
-            return self._sample_static(one, layer).function
+            return self._sample_static(one, layer, self.scaling).function
 
-    def _sample_static(self, one: Wire, layer: Static) -> StaticSystem:
+    def _sample_static(self, one: Wire, layer: Static, scaling: Scaling | None) -> StaticSystem:
         function = sample_static(
             one.name,
             channels=one.channels,
@@ -217,6 +218,8 @@ class Cascade:
             mean=layer.mean or "constant",
             learn_locations=layer.learn_locations,
         )
+        if layer.limits is not None:
+            function = replace(function, limits=_scaled_limits(layer.limits, scaling))
         if not one.pathwise or self.integrate == "all":
             return StaticSystem(function)
         one_ = torch.ones(layer.outputs, layer.support, dtype=torch.float64)
@@ -261,6 +264,23 @@ class Cascade:
             }
             return system.after(zeros)
         return system.after(states)
+
+
+def _scaled_limits(
+    limits: tuple[float | None, float | None], scaling: Scaling | None
+) -> tuple[float, float]:
+    """Limits of the (single) output in scaled units, infinite where there is none."""
+    if scaling is None:
+        raise invalid(
+            "scaling", expected="that of the training record, for a layer with limits",
+            got="None", advice="Use model.scaled_to(record).",
+        )  # fmt: skip
+    low, high = (
+        sign * math.inf if one is None
+        else (one - float(scaling.output_offset[0])) / float(scaling.output_scale[0])
+        for one, sign in zip(limits, (-1.0, 1.0), strict=True)
+    )  # fmt: skip
+    return low, high
 
 
 def support_points(locations: Tensor, count: int) -> Tensor:

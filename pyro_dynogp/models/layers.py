@@ -44,7 +44,10 @@ class Static:
     Args:
         outputs: width of the layer. inducing: number of inducing values for each output.
         kernel: a gpytorch kernel; Matern-3/2 with a lengthscale for each channel by default.
-        mean: "linear" or "constant"; by default linear for a first layer, else constant.
+        mean: "linear" or "constant" prior mean; by default linear for a first layer and where
+            there are limits, else constant. Beyond the data a function goes back to it.
+        limits: lowest and highest value of the linear mean [output], None for none: those of a
+            sensor that stops. Of a last layer of one signal and one output.
         skip: names of earlier signals that the layer sees too.
         learn_locations: whether the inducing locations are learnt.
         support: number of points at which the residual of the function given its inducing values
@@ -56,6 +59,7 @@ class Static:
     inducing: int = 32
     kernel: Any = None
     mean: Literal["constant", "linear"] | None = None
+    limits: tuple[float | None, float | None] | None = None
     skip: tuple[str, ...] = ()
     learn_locations: bool = True
     support: int = 64
@@ -118,8 +122,10 @@ def wire(inputs: int, layers: Sequence[Layer]) -> tuple[Wire, ...]:
                 raise invalid(
                     f"layer {name!r}", expected="inputs for a static layer", got="no channels"
                 )
-            mean = layer.mean or ("linear" if place == 0 else "constant")
-            layer = replace(layer, mean=mean)
+            linear = place == 0 or layer.limits is not None
+            layer = replace(layer, mean=layer.mean or ("linear" if linear else "constant"))
+            if layer.limits is not None:
+                _check_limits(name, layer, channels, place == len(layers) - 1)
         elif channels == 0 and not layer.process_noise:
             raise invalid(
                 f"process_noise of layer {name!r}",
@@ -185,3 +191,21 @@ def _check_layer(name: str, layer: Layer) -> None:
             raise invalid(
                 f"{argument} of layer {name!r}", expected="a whole number >= 1", got=repr(value)
             )
+
+
+def _check_limits(name: str, layer: Static, channels: int, last: bool) -> None:
+    assert layer.limits is not None
+    known = [one for one in layer.limits if one is not None]
+    if len(layer.limits) != 2 or not known or known != sorted(set(known)):
+        raise invalid(
+            f"limits of layer {name!r}",
+            expected="(low, high) with low < high; None for one that is not there",
+            got=repr(layer.limits),
+        )
+    if not last or layer.mean != "linear" or (channels, layer.outputs) != (1, 1):
+        raise invalid(
+            f"limits of layer {name!r}",
+            expected="a last layer with a linear mean, of one signal and one output",
+            got=f"mean {layer.mean!r}, {channels} signals, {layer.outputs} outputs"
+            + ("" if last else ", not the last layer"),
+        )

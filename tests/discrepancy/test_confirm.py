@@ -14,7 +14,14 @@ import pyro_dynogp as dgp
 from pyro_dynogp.channels import Calendar, Delayed, ShiftedClock
 from pyro_dynogp.discrepancy import effects
 from pyro_dynogp.discrepancy.blocks import shared
-from pyro_dynogp.discrepancy.confirm import _first_in_line, _judge, _Judged, _specific, confirm
+from pyro_dynogp.discrepancy.confirm import (
+    _first_in_line,
+    _judge,
+    _Judged,
+    _specific,
+    _too_special,
+    confirm,
+)
 from pyro_dynogp.discrepancy.evidence import Evidence
 from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.discrepancy.trials import Tried, interleaved, stretches
@@ -77,6 +84,19 @@ def test_of_effects_that_are_one_block_the_specific_one_gives_the_name_if_it_is_
 
     assert leading(0.01) == "saturation"
     assert leading(0.3) == "output nonlinearity"
+
+
+@pytest.mark.parametrize(
+    ("q", "others", "too_special"),
+    [
+        (0.01, {"saturation", "output nonlinearity"}, False),
+        (0.3, {"saturation", "output nonlinearity"}, True),
+        (0.3, {"saturation", "dead zone"}, False),
+    ],
+)
+def test_a_special_case_gives_its_name_where_it_is_certain_or_alone(q, others, too_special) -> None:
+    found = spoken_for(effects.Saturation(), 1e-3, q)
+    assert _too_special(found, others, 0.05) == too_special
 
 
 def judged_noise(gains: np.ndarray, errors: np.ndarray, before: np.ndarray) -> _Judged:

@@ -57,6 +57,17 @@ def assert_equal(a, b):
     assert np.array_equal(a.start_energies, b.start_energies)
 
 
+def test_limits_of_a_sensor_are_kept(tmp_path):
+    record = wiener_record(n=60)
+    low = float(np.quantile(record.outputs, 0.2))
+    layers = (dgp.Dynamic(pairs=1), dgp.Static(inducing=5, limits=(low, None)))
+    fit = prior_fit(dgp.Cascade(1, layers), record)
+    fit.save(tmp_path / "fit.safetensors")
+    again = dgp.load(tmp_path / "fit.safetensors")
+    assert again.model.layers[-1].limits == (low, None)
+    assert_same_predictions(fit, again, record)
+
+
 def assert_same_predictions(a, b, record):
     rest = wiener_record(n=len(record) + 20)[len(record) :]
     for one, two in (

@@ -1,6 +1,7 @@
 """Static functions against dense algebra, GPyTorch's SVGP and exact conditional moments."""
 
 import math
+from dataclasses import replace
 
 import gpytorch
 import numpy as np
@@ -35,6 +36,19 @@ class TestConditional:
         close(f.moments(x)[1], variance)
         linear = f.kernel(x, f.locations) @ f.weights.mT
         close(f.prior_mean(x) + linear, expected)
+
+    def test_limits_are_those_of_the_prior_mean(self, channels, outputs, mean):
+        """The function itself may go beyond them: what the data say of it comes on top."""
+        free = function(channels=channels, outputs=outputs, mean=mean)
+        f = replace(free, limits=(-0.2, 0.4))
+        x = normal(9, channels)
+        straight = Dense(free).prior_mean(x.numpy())
+        close(f.prior_mean(x), np.clip(straight, -0.2, 0.4))
+        close(f.mean(x) - f.prior_mean(x), free.mean(x) - free.prior_mean(x))
+        close(f.variance(x), free.variance(x))
+        close(f.mean(f.locations), f.inducing_values.mT, atol=1e-6)
+        nowhere = replace(free, limits=(-math.inf, 0.4))
+        close(nowhere.prior_mean(x), np.minimum(straight, 0.4))
 
     def test_at_the_locations_it_is_the_inducing_values(self, channels, outputs, mean):
         f = function(channels=channels, outputs=outputs, mean=mean)

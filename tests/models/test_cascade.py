@@ -335,6 +335,27 @@ def test_initial_state_is_a_site_where_a_static_layer_sees_it(initial_state):
     assert dgp.Wiener(0, **SMALL).state_sites == ()
 
 
+def test_limits_of_a_sensor_are_in_the_unit_of_the_output():
+    """What the data say nothing of goes on as a straight line does, and stops at the limits."""
+    record = make_record()
+    low, high = np.quantile(record.outputs, [0.1, 0.8])
+    model = dgp.Cascade(1, (dgp.Dynamic(pairs=1), dgp.Static(inducing=4, limits=(low, high))))
+    f = model.scaled_to(record).wires[-1]
+    offset, scale = record.outputs.mean(), record.outputs.std()
+    values = {
+        "f_lengthscale": torch.ones(1).double(), "f_output_scale": torch.ones(1).double(),
+        "f_constant": torch.zeros(1).double(), "f_slope": torch.ones(1, 1).double(),
+        "f_center": torch.zeros(1).double(), "f_half_width": torch.ones(1).double(),
+        "f_values": torch.zeros(1, 4).double(),
+    }  # fmt: skip
+    function = model.scaled_to(record).static_given(f, f.layer, values)
+    x = torch.linspace(-9.0, 9.0, 50).double().unsqueeze(-1)
+    expected = np.clip(offset + scale * x.numpy(), low, high)
+    assert np.allclose(offset + scale * function.mean(x).numpy(), expected, rtol=1e-12)
+    with pytest.raises(ValueError, match="scaling: expected that of the training record"):
+        model.static_given(f, f.layer, values)
+
+
 def test_first_state_acts_on_the_beginning():
     """The site moves the first samples of the mean of g, and is forgotten later."""
     model, record = case("Wiener", n=60, step=1.0)

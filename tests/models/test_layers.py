@@ -45,6 +45,8 @@ def test_a_first_static_layer_has_a_linear_mean_others_a_constant_one():
     means = [one.layer.mean for one in wire(1, (Static(), Dynamic(), Static()))[::2]]
     assert means == ["linear", "constant"]
     assert wire(1, (Static(mean="constant"),))[0].layer.mean == "constant"
+    stops = wire(1, (Dynamic(), Static(limits=(None, 2.0))))[-1].layer
+    assert (stops.mean, stops.limits) == ("linear", (None, 2.0))
 
 
 @pytest.mark.parametrize(("inputs", "layers", "message"), [
@@ -57,6 +59,12 @@ def test_a_first_static_layer_has_a_linear_mean_others_a_constant_one():
     (1, (Dynamic(name="offset"),), "none of .*'offset'"),
     (1, (Dynamic(), Static(skip=("g2",))), r"skip of layer 'f': expected names of earlier signals"),
     (1, (Dynamic(skip=("f",)), Static()), "skip of layer 'g'.*got 'f'"),  # forward
+    (1, (Dynamic(), Static(limits=(2.0, 1.0))), "limits of layer 'f': expected .* low < high"),
+    (1, (Dynamic(), Static(limits=(None, None))), "limits of layer 'f': expected"),
+    (1, (Dynamic(), Static(limits=(1.0,))), "limits of layer 'f': expected"),
+    (1, (Static(limits=(0.0, 1.0)), Dynamic()), "limits of layer 'f'.*not the last layer"),
+    (1, (Dynamic(outputs=2), Static(limits=(0.0, 1.0))), "limits of layer 'f'.*got .*2 signals"),
+    (1, (Dynamic(), Static(mean="constant", limits=(0.0, 1.0))), "got mean 'constant'"),
     (1, (Dynamic(skip=("inputs",)),), "skip of layer 'g'"),  # seen already
     (1, (Dynamic(), Static(skip=("f",))), "skip of layer 'f'.*got 'f'"),  # itself
     (0, (Static(),), "expected inputs for a static layer"),

@@ -31,6 +31,8 @@ class Effect:
         score: on which densities it must pay: of forecasts, or one step ahead.
         compared: on which data its variants are: those that are fitted to, or, where variants
             differ in how they go on, those held out (the first that does as well as the best).
+        special_of: name of an effect of which it is a special case; its own name is given only
+            where the residual is certain of it.
         once: whether it is not looked for again in a model that has it.
         added: whether a block mends it; False for what is only reported.
         test: finds evidence in residuals; a class whose test needs more overrides `detect`.
@@ -42,6 +44,7 @@ class Effect:
     localised: ClassVar[bool] = False
     score: ClassVar[Score] = "forecast"
     compared: ClassVar[Compared] = "training"
+    special_of: ClassVar[str] = ""
     once: ClassVar[bool] = False
     added: ClassVar[bool] = True
     test: ClassVar[Callable[..., Evidence | Sequence[Evidence]]]

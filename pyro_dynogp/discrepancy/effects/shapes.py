@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import ClassVar
 
+import numpy as np
+
 from pyro_dynogp.channels import DeadZone, Play
 from pyro_dynogp.discrepancy.effects.base import AROUND, FINER, Effect, changed, finer, number_of
 from pyro_dynogp.discrepancy.evidence import Evidence
@@ -49,12 +51,24 @@ class OutputNonlinearity(Nonlinearity):
     add = staticmethod(with_output_function)
 
 
-class Saturation(OutputNonlinearity):
+class Saturation(Effect):
     """A sensor that clips."""
 
     name = "saturation"
-    freedom = 1
+    family = "shapes"
+    special_of = OutputNonlinearity.name
     test = staticmethod(saturation)
+
+    def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
+        """A static layer at the output whose prior mean stops at the limits."""
+        low, high = (
+            at if np.isfinite(at := number_of(evidence, end)) else None for end in ("low", "high")
+        )
+        if model.outputs > 1:  # which of them the limits are of is not said
+            low = high = None
+        limits = None if low is None and high is None else (low, high)
+        extended = with_output_function(model, limits)
+        return [] if extended is None else [extended]
 
 
 class InputNonlinearity(Nonlinearity):

@@ -150,10 +150,10 @@ class CalendarEffect(Effect):
         self.zones = tuple(zones)
 
     def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
-        """One for each part of the calendar."""
+        """One of the day and the week, and one of the year where the record is long enough."""
         if residuals.stamps is None:
             return []
-        return listed(calendar(residuals, zones=self.zones, seed=seed))
+        return calendar(residuals, zones=self.zones, seed=seed)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
         """The part of the calendar as direct inputs; or all that the model has, on that clock.
