@@ -22,6 +22,8 @@ ERRORS = 2.0
 # Or if it still is where no sample counts for more nats: an outlier may gain hundreds, which make
 # the standard error as large as the sum. What is left is less than the whole gain, never more.
 CAP = 10.0
+# Share of a gain that a special case of an effect may lack.
+SPECIAL = 0.05
 # Noise may cost the forecasts so much of their mean absolute error: other weights of the samples
 # move a model a little, which a long record is certain of; structure taken for noise costs more.
 HARM = 0.05
@@ -265,8 +267,15 @@ def _best(judged: Sequence[_Judged]) -> _Judged:
 
 
 def _ties(one: _Judged, best: _Judged) -> bool:
-    """Whether two candidates explain held-out data equally well, within two standard errors."""
+    """Whether two candidates explain held-out data equally well, within two standard errors.
+
+    A special case of the best one need not gain quite as much: what is left of it are differences
+    of fits.
+    """
     if one.tried.failure:
         return False
     d = best.tried.densities - one.tried.densities
-    return bool(d.sum() <= max(ERRORS * block_standard_error(d)[0], NATS))
+    slack = max(ERRORS * block_standard_error(d)[0], NATS)
+    if one.found.effect.special_of == best.found.effect.name:
+        slack = max(slack, SPECIAL * best.attempt.gain)
+    return bool(d.sum() <= slack)

@@ -11,6 +11,7 @@ from pyro_dynogp.discrepancy.blocks import blocks_of
 from pyro_dynogp.discrepancy.course import Course
 from pyro_dynogp.discrepancy.effects import CATALOGUE, Effect
 from pyro_dynogp.discrepancy.extend import has_function, used_channels
+from pyro_dynogp.discrepancy.known_inputs import longest_delay, where_inputs_are_known
 from pyro_dynogp.discrepancy.refits import poles_of, quick_fit
 from pyro_dynogp.discrepancy.report import Report
 from pyro_dynogp.discrepancy.reporting import report_of
@@ -99,7 +100,9 @@ def close_loop(
     warnings = [fault.sentence for fault in data.faults if fault.channel in channels]
     warnings += [*course.notes, *course.said_of_hiding()]
     fits = [first, course.current] if course.accepted else [first]
-    fitted = _final(fits, data.known, workers, progress)
+    # The same samples for both, so that they can be compared.
+    known = where_inputs_are_known(data.known, longest_delay(course.model))
+    fitted = _final(fits, known, workers, progress)
     watch.stop("last fits")
     return report_of(fitted[0], fitted[-1], course, warnings)
 

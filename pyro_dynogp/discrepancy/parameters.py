@@ -12,6 +12,7 @@ from torch import Tensor
 from pyro_dynogp.channels import Channel, Delayed, Quantity, count_direct, prepared
 from pyro_dynogp.channels.base import unit_of
 from pyro_dynogp.criticism.posterior_draws import draws_of
+from pyro_dynogp.discrepancy.known_inputs import where_inputs_are_known
 from pyro_dynogp.inference.number import Number, number_posterior
 from pyro_dynogp.inference.potential import Potential
 from pyro_dynogp.lti.views import steady_state_gain
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 
 Parameters = dict[str, tuple[float, float]]
 DRAWS = 200
+# Beyond how many times a delay, and how many steps more, others are not expected; and the share of
+# a record that may be lost to comparing them.
+DELAYS, STEPS, LOST = 1.5, 5, 0.25
 
 
 def parameters_of(fit: Fit, channels: Sequence[Channel], record: Record) -> Parameters:
@@ -127,6 +131,9 @@ def _together(channels: Sequence[Channel]) -> list[list[Channel]]:
 def _numbers(fit: Fit, group: Sequence[Channel], record: Record) -> Parameters:
     """Of the numbers that a channel, or a group with the same ones, is made with."""
     first = group[0]
+    if isinstance(first, Delayed):  # all delays that are likely, on the same samples
+        reach = DELAYS * first.delay + STEPS * record.sampling_time
+        record = where_inputs_are_known(record, min(reach, LOST * record.duration))
     whole = prepared(record, fit.model.channels)
     fields = list(first.numbers)
     numbers = [

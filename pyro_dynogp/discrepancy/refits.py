@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from pyro_dynogp.discrepancy.extend import Model, has_function
+from pyro_dynogp.discrepancy.known_inputs import longest_delay, where_inputs_are_known
 from pyro_dynogp.inference.cascade_fit import climb, grow, starting_points
 from pyro_dynogp.inference.checkpoints import NOTHING_KEPT
 from pyro_dynogp.inference.descent import descend
@@ -132,8 +133,11 @@ def poles_of(fit: Fit) -> np.ndarray | None:
 
 
 def _scaled(model: Model, record: Record) -> tuple[Model, tuple[Record, ...]]:
-    """The model in the units of a record, and the record with the model's channels."""
-    records = model.check(record)
+    """The model in the units of a record, and the record with the model's channels.
+
+    Outputs count where the model knows its inputs.
+    """
+    records = model.check(where_inputs_are_known(record, longest_delay(model)))
     return replace(model, scaling=None).scaled_to(records), records
 
 

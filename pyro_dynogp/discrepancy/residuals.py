@@ -11,6 +11,7 @@ from pyro_dynogp._errors import invalid
 from pyro_dynogp.channels import count_direct
 from pyro_dynogp.criticism.posterior_draws import draws_of, with_draws
 from pyro_dynogp.discrepancy.evidence import Residuals
+from pyro_dynogp.discrepancy.known_inputs import longest_delay, unknown_beginning
 from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.record import Record
 
@@ -34,7 +35,8 @@ def residuals_of(
 ) -> Residuals:
     """Simulation residuals and innovations of one output, in the units of the record.
 
-    The output counts as missing until the simulation, whose first state is unknown, has settled.
+    The output counts as missing until the model knows its inputs, until the simulation, whose first
+    state is unknown, has settled, and where it is exactly at a limit that the model knows.
 
     Args:
         fit: the fit. record: along which, in one piece.
@@ -64,13 +66,18 @@ def residuals_of(
     deviations = component[chosen][:, :, output]
     driving = prepared.n_inputs - count_direct(fit.model.channels)
     y = record.outputs[:, output].copy()
-    y[: settling(fit, record)] = np.nan
+    unknown = unknown_beginning(record, longest_delay(fit.model))
+    y[: unknown + settling(fit, record)] = np.nan
+    innovations = fit.innovations(prepared)[:, output]
+    if isinstance(fit.model, Cascade):  # a sensor at its limit says nothing of the error there
+        stopped = fit.model.at_limits(prepared)
+        y[stopped], innovations = np.nan, np.where(stopped, np.nan, innovations)
     return Residuals(
         time=record.time,
         output=y,
         mean=mean,
         deviations=deviations - deviations.mean(0),
-        innovations=fit.innovations(prepared)[:, output],
+        innovations=innovations,
         inputs=prepared.inputs[:, :driving],
         input_names=prepared.input_names[:driving],
         candidates={name: record.extra[name] for name in candidates},

@@ -12,6 +12,7 @@ from scipy.special import logsumexp
 
 from pyro_dynogp.criticism.densities import pointwise_log_density
 from pyro_dynogp.discrepancy.extend import Model
+from pyro_dynogp.discrepancy.known_inputs import comparable
 from pyro_dynogp.discrepancy.refits import energy, poles_of, quick_fit, race
 from pyro_dynogp.inference.result import Fit
 from pyro_dynogp.models.cascade import Cascade
@@ -27,8 +28,9 @@ Score = Literal["one step", "forecast"]
 Compared = Literal["training", "held out"]
 # Differences of held-out log-densities that count are larger [nats].
 NATS = 4.0
-# How often the best variant is refined.
-REFINEMENTS = 2
+# How often the best variant is refined, and how much longer than the longest delay of the first
+# variants one of them may come to be.
+REFINEMENTS, REACH = 2, 1.3
 
 
 @dataclass(frozen=True)
@@ -116,14 +118,16 @@ def _kept(trial: Trial, training: Record) -> Fit:
         return _best_ahead(trial, training)
     base = trial.base
     (model, *others), start = trial.models, base
-    if others or _finer(trial, model, training, 0):
-        found, problems = race(trial.models, training, base, trial.seed)
+    finer = _finer(trial, model, training, 0)
+    if others or finer:
+        same = comparable(training, [*trial.models, *finer], REACH)
+        found, problems = race(trial.models, same, base, trial.seed)
         if not found:
             raise ValueError(problems[0])
         start = found[0]
         for times in range(REFINEMENTS):
             finer = _finer(trial, _unscaled(start), training, times)
-            start = min([start, *race(finer, training, start, trial.seed)[0]], key=energy)
+            start = min([start, *race(finer, same, start, trial.seed)[0]], key=energy)
         model = _unscaled(start)
     return quick_fit(model, training, trial.seed, start, poles=poles_of(base))
 

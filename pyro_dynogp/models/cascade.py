@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 
+import numpy as np
 import pyro
 import pyro.distributions as dist
 import torch
@@ -47,7 +48,8 @@ class Cascade:
     conditional given the inducing values; below a dynamic layer one function along the path, which
     ``f_residual`` completes (`pyro.deterministic`). ``offset`` (n_y,) where a dynamic layer comes
     last; the likelihood's sites; ``y``. With several records trajectories and outputs are numbered
-    (``g_0``, ``y_0``, ...). ``direct`` (n_y, K) for inputs that act at once.
+    (``g_0``, ``y_0``, ...). ``direct`` (n_y, K) for inputs that act at once. Where the last layer
+    has limits, a factor ``at_limits`` makes probabilities of outputs that are exactly there.
 
     Args:
         inputs: n_u, those that channels make included.
@@ -243,6 +245,30 @@ class Cascade:
             else:
                 last = self.integrate == "last"
                 observe_explicit(here, scaling, record, suffix, u, last_integrated=last)
+            self._count_limits(here, record, suffix, u)
+
+    def at_limits(self, record: Record) -> np.ndarray:
+        """Where the output (n,) is exactly at a limit of the last layer."""
+        last = self.layers[-1]
+        if not isinstance(last, Static) or last.limits is None or not record.n_outputs:
+            return np.zeros(len(record), dtype=bool)
+        known = [one for one in last.limits if one is not None]
+        there: np.ndarray = np.isin(record.outputs[:, 0], known)
+        return there
+
+    def _count_limits(
+        self, system: CascadeSystem, record: Record, suffix: str, inputs: Tensor
+    ) -> None:
+        """Take samples that are exactly at a sensor's limit for what they are: probabilities.
+
+        Their density, which has no upper bound where the noise vanishes, times sqrt(2 pi) times the
+        noise's scale is at most one, as the probability of being beyond the limit is.
+        """
+        at = self.at_limits(record)
+        if at.any():
+            sd = system.noise_sd(inputs, record.time)[..., 0]
+            sd = sd.expand((*sd.shape[:-1], len(at)))[..., torch.as_tensor(at)]
+            pyro.factor(f"at_limits{suffix}", (sd.log() + 0.5 * math.log(2.0 * math.pi)).sum(-1))
 
     def sample_states(self, suffix: str) -> dict[str, Tensor]:
         """Sample what past inputs left at the first sample of a record, by layer."""

@@ -1,5 +1,8 @@
 """Cascades as Pyro models: which sites there are, that the value of each is used, and for what."""
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pyro
 import pytest
@@ -354,6 +357,27 @@ def test_limits_of_a_sensor_are_in_the_unit_of_the_output():
     assert np.allclose(offset + scale * function.mean(x).numpy(), expected, rtol=1e-12)
     with pytest.raises(ValueError, match="scaling: expected that of the training record"):
         model.static_given(f, f.layer, values)
+
+
+@pytest.mark.parametrize("integrate", ["none", "all"])
+def test_outputs_at_a_limit_are_probabilities(integrate):
+    """However small the noise, none of them counts for more than a probability of one."""
+    record = make_record(n=24)
+    top = float(np.sort(record.outputs[:, 0])[-6])
+    stopped = record.with_outputs(np.minimum(record.outputs, top))
+    model = dgp.Wiener(inputs=1, pairs=1, inducing=4)
+    given = dgp.Static(inducing=4, mean="linear", limits=(None, top))
+    model = replace(model, layers=(model.layers[0], given), integrate=integrate)
+    model = model.scaled_to(record)
+    assert model.at_limits(stopped).sum() == 6
+    trace = draw(model, stopped)
+    count = 6 * (trace.nodes["noise_sd"]["value"].log() + 0.5 * math.log(2.0 * math.pi))
+    assert trace.nodes["at_limits"]["fn"].log_factor.item() == pytest.approx(
+        count.item(), rel=1e-12
+    )
+    assert "at_limits" not in draw(model, record.with_outputs(0.5 * record.outputs)).nodes
+    blank_record = record.with_outputs(np.full((24, 1), np.nan))
+    assert "at_limits" not in draw(model, blank_record).nodes
 
 
 def test_first_state_acts_on_the_beginning():

@@ -57,6 +57,7 @@ class Saturation(Effect):
     name = "saturation"
     family = "shapes"
     special_of = OutputNonlinearity.name
+    once = True
     test = staticmethod(saturation)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
