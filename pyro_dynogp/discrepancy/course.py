@@ -13,7 +13,7 @@ from pyro_dynogp.discrepancy.evidence import Residuals
 from pyro_dynogp.discrepancy.extend import Model, has_process_noise
 from pyro_dynogp.discrepancy.refits import quick_fit
 from pyro_dynogp.discrepancy.report import Attempt
-from pyro_dynogp.discrepancy.rounds import Looked, Rounds, Stopwatch
+from pyro_dynogp.discrepancy.rounds import Looked, Rounds, Stopwatch, goes_with_inputs
 from pyro_dynogp.discrepancy.search import Candidate, Found, candidates_of
 from pyro_dynogp.discrepancy.trials import without
 from pyro_dynogp.discrepancy.words import OUTSIDE
@@ -21,6 +21,9 @@ from pyro_dynogp.record import Record
 
 if TYPE_CHECKING:
     from pyro_dynogp.inference.result import Fit
+
+FED_BACK = "inputs are under feedback, for which the residual speaks more clearly"
+OTHERS = "others are more probable, or no block of the model stands for it"
 
 
 @dataclass(eq=False)
@@ -79,8 +82,9 @@ class Course:
         rounds, known = self.rounds, self.rounds.data.known
         chosen: list[Candidate] = []
         if self.left:
-            chosen = candidates_of(looked.found, self.model, known, rounds.level, rounds.tries)
-        self.attempts += _untried(looked.found, chosen, rounds.level, self.number)
+            open_loop = [f for f in looked.found if not self._is_fed_back(f)]
+            chosen = candidates_of(open_loop, self.model, known, rounds.level, rounds.tries)
+        self.attempts += self._untried(looked.found, chosen)
         if chosen:
             confirmed = rounds.confirm(chosen, self.current, self.number)
             self.watch.stop("refits")
@@ -142,6 +146,34 @@ class Course:
             done = "Neither without it nor with it did the search find anything to add."
         return [f"The model as given {self.hidden}: such noise can hide what is missing. {done}"]
 
+    def _is_fed_back(self, found: Found) -> bool:
+        """Whether inputs under feedback make an effect: it goes with them, and is less certain.
+
+        Inputs that follow the output's disturbances are among what explains the residual, whatever
+        the model is. (What a model lacks may look like feedback, but less than like itself.)
+        """
+        certain = [f.evidence.p_value for f in self.reported]
+        return (
+            bool(certain)
+            and goes_with_inputs(found.effect)
+            and found.evidence.p_value > min(certain)
+        )
+
+    def _untried(self, found: Sequence[Found], chosen: Sequence[Candidate]) -> list[Attempt]:
+        """Effects that the residual speaks for, but that were not refitted."""
+        tried = [one for one, _ in chosen]
+        attempts = []
+        for f in found:
+            if f.q_value > self.rounds.level or any(f is one for one in tried):
+                continue
+            attempt = Attempt(self.number, f.evidence, f.q_value, "not tried", OTHERS)
+            if not f.effect.added:
+                attempt = replace(attempt, decision="reported", reason="is reported, not added")
+            elif self._is_fed_back(f):
+                attempt = replace(attempt, reason=FED_BACK)
+            attempts.append(attempt)
+        return attempts
+
     def _add(self, winner: Found, confirmed: Confirmed, larger: Model, looked: Looked) -> None:
         """Go on with the model that a winner extends."""
         rounds = self.rounds
@@ -168,20 +200,3 @@ def _spikes(residuals: Sequence[Residuals], record: Record) -> list[str]:
     """Spikes of the outputs, in words, also in samples that tests leave out."""
     whole = [replace(one, output=record.outputs[:, a]) for a, one in enumerate(residuals)]
     return [fault.sentence for one in whole if (fault := data_spikes(one)) is not None]
-
-
-def _untried(
-    found: Sequence[Found], chosen: Sequence[Candidate], level: float, number: int
-) -> list[Attempt]:
-    """Effects that the residual speaks for, but that were not refitted."""
-    tried = [one for one, _ in chosen]
-    return [
-        Attempt(
-            number, f.evidence, f.q_value,
-            "not tried" if f.effect.added else "reported",
-            "others are more probable, or no block of the model stands for it" if f.effect.added
-            else "is reported, not added",
-        )
-        for f in found
-        if f.q_value <= level and not any(f is one for one in tried)
-    ]  # fmt: skip

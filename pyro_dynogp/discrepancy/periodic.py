@@ -127,6 +127,7 @@ def _lines(bins: np.ndarray, length: int, nuisance: np.ndarray, missing: np.ndar
             there[k:] &= ~missing[: n - k]
             there[:k] = False
         rows = np.flatnonzero(there)
+        beside = spanning(nuisance[rows])
         mask = there.astype(float)
         double = fft(mask, length)[(2 * bins) % length]
 
@@ -138,7 +139,7 @@ def _lines(bins: np.ndarray, length: int, nuisance: np.ndarray, missing: np.ndar
 
         def score(x: np.ndarray):
             past = [x[rows - k] for k in range(1, p + 1)]
-            Q = np.linalg.qr(np.column_stack([nuisance[rows], *past]))[0]
+            Q = np.linalg.qr(np.column_stack([beside, *past]))[0]
             e = x[rows] - Q @ (Q.T @ x[rows])
             C, S = parts(np.column_stack([e, Q]))
             c, s, C, S = C[0], S[0], C[1:], S[1:]
@@ -154,7 +155,7 @@ def _lines(bins: np.ndarray, length: int, nuisance: np.ndarray, missing: np.ndar
             gains = samples * log_ratio(np.where(usable, explained, 0.0), float(e @ e))
 
             def fit(j: int) -> tuple[np.ndarray, np.ndarray]:
-                line = _sine(n, bins[j] / length)
+                line = _wave(n, bins[j] / length)
                 design = np.column_stack([*past, line[rows], nuisance[rows]])
                 own_filter = Whitener(np.linalg.lstsq(design, x[rows], rcond=1e-9)[0][:p])
                 return explained_by(own_filter, there[p:], line, nuisance, x)
@@ -170,6 +171,19 @@ def _sine(n: int, frequency: float) -> np.ndarray:
     """Cosine and sine (n, 2) of a frequency [1 / step]."""
     angle = 2.0 * np.pi * frequency * np.arange(n)
     return np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def _wave(n: int, frequency: float) -> np.ndarray:
+    """Sines of a frequency and its harmonics, and how they change with it (n, K).
+
+    Of a strong line what a grid of frequencies misses, and what its harmonics are, would still look
+    like colour, which a filter of high order explains.
+    """
+    shift = np.linspace(-1.0, 1.0, n)[:, None]
+    # At half the sampling rate a sine is nothing, and next to it is nearly what a cosine becomes.
+    inside = [h * frequency for h in range(1, HARMONICS + 1) if h * frequency < 0.5 - 2.0 / n]
+    waves = [_sine(n, f) for f in inside] or [_sine(n, frequency)]
+    return np.column_stack([*waves, *(shift * wave for wave in waves if inside)])
 
 
 def _refined(

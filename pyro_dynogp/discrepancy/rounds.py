@@ -12,7 +12,7 @@ import numpy as np
 from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.discrepancy.blocks import Blocks, shared
 from pyro_dynogp.discrepancy.confirm import Confirmed, certain, confirm
-from pyro_dynogp.discrepancy.effects import Effect
+from pyro_dynogp.discrepancy.effects import ClockShift, Effect
 from pyro_dynogp.discrepancy.evidence import Residuals
 from pyro_dynogp.discrepancy.extend import (
     used_channels,
@@ -35,6 +35,12 @@ OF_INPUTS = ("paths", "shapes")
 # the effect is not seen beside it. (Where the effect is what was missing that gains at most as
 # much, as products of an input resemble its square, and nothing once it is added.)
 FAR = 2.0
+
+
+def goes_with_inputs(effect: Effect) -> bool:
+    """Whether an effect is one between inputs and output."""
+    of_inputs = effect.family in OF_INPUTS and effect.score == "forecast"
+    return of_inputs or isinstance(effect, ClockShift)
 
 
 class Stopwatch:

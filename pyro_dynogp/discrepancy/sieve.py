@@ -7,7 +7,8 @@ looks like drift. Hence in two steps, for the residual and for every replicate a
 1. under a first filter, the same for all, the best variant of the effect is found and taken out;
 2. a second filter is fitted to the rest; under it the residual's gains are looked at.
 
-Where the colour can be estimated beside the effect at little cost that takes the place of both.
+Where the colour can be estimated beside the effect at little cost (`joint`) that takes the place of
+the filters, of which only the second one's order is used.
 
 The replicates are series of that second filter, driven by its own residuals in random order with
 replacement: the sieve bootstrap (Bühlmann, Bernoulli 3(2):123-148, 1997), with the filter estimated
@@ -91,7 +92,8 @@ def sieve(
         first: (n, M) columns that are taken out, by least squares, before the first filter is
             fitted, so that the effect does not hide itself there.
         joint: the score estimates the colour beside the effect and takes of a filter no more than
-            its order; then no effect is taken out of the replicates beforehand.
+            its order. What a strong effect leaves of the order is seen once it is taken out, so
+            that the first filter is none.
         replicates: number of replicates under the null. seed: of their random numbers.
 
     Raises:
@@ -101,14 +103,17 @@ def sieve(
     there = np.isfinite(residual)
     level = float(residual[there].mean()) if there.any() else 0.0
     x = residual - level
-    coarse = prepare(fitted_filter(x if first is None else _without(x, first)))
+    if joint:
+        coarse = prepare(Whitener(np.zeros(0)))
+    else:
+        coarse = prepare(fitted_filter(x if first is None else _without(x, first)))
 
     def rest(x: np.ndarray) -> np.ndarray:
         gains, fit = coarse(x)
         return x - fit(int(np.argmax((gains - K) / np.sqrt(2.0 * K))))[1]
 
     def tested(x: np.ndarray) -> tuple[np.ndarray, Score]:
-        score = prepare(fitted_filter(x if joint else rest(x)))
+        score = prepare(fitted_filter(rest(x)))
         return score(x)[0], score
 
     left = rest(x)
@@ -216,13 +221,18 @@ def spanning(columns: np.ndarray) -> np.ndarray:
 def projector(
     whiten: Whitener, nuisance: np.ndarray, missing: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows that are there (n - p,), and the whitened nuisance on them: Q (m, M), R (M, M)."""
+    """Rows that are there (n - p,), and the whitened nuisance on them as Q R: (m, r) and (r, M).
+
+    On fewer rows columns may depend on each other that did not before, as what is there at the
+    first sample alone. Their directions are rounding, and are left out.
+    """
     there = np.isfinite(whiten(np.where(missing, np.nan, 0.0)))
     if there.sum() < 30:
         got = f"{int(there.sum())}"
         raise invalid("residual", expected="at least 30 samples beside gaps", got=got)
-    Q, R = np.linalg.qr(whiten(nuisance)[there])
-    return there, Q, R
+    Q, values, V = np.linalg.svd(whiten(nuisance)[there], full_matrices=False)
+    kept = values > 1e-6 * values[0]
+    return there, Q[:, kept], values[kept, None] * V[kept]
 
 
 def log_ratio(explained: np.ndarray, total: float) -> np.ndarray:

@@ -174,6 +174,25 @@ def test_where_nothing_can_be_added_without_process_noise_the_search_begins_agai
 
 
 @pytest.mark.parametrize(
+    ("effect", "p", "certain", "fed_back"),
+    [
+        (effects.DeadTime(), 1e-4, [1e-9], True),
+        (effects.ClockShift(), 1e-4, [1e-9], True),
+        (effects.DeadTime(), 1e-12, [1e-9], False),  # what looks like feedback is this
+        (effects.DeadTime(), 1e-4, [], False),
+        (effects.LevelShift(), 1e-4, [1e-9], False),  # inputs have nothing to do with it
+        (effects.ProcessNoise(), 1e-4, [1e-9], False),
+    ],
+)
+def test_what_goes_with_inputs_under_feedback_is_not_tried(effect, p, certain, fed_back):
+    def found(effect, p):
+        return Found(effect, Evidence(effect.name, 5.0, p, 1.0, 0.1), 10.0 * p)
+
+    course = SimpleNamespace(reported=[found(effects.Feedback(), one) for one in certain])
+    assert Course._is_fed_back(course, found(effect, p)) == fed_back
+
+
+@pytest.mark.parametrize(
     ("noise", "accepted", "returned", "said"),
     [
         ((True, False), True, False, "the extended model does without it"),

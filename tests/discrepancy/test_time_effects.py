@@ -118,6 +118,19 @@ class TestLevelShift:
 
 
 class TestPeriodicDisturbance:
+    @pytest.mark.parametrize("size", [0.5, 2.0, 8.0])
+    def test_strong_lines_are_found_as_well_as_weak_ones(self, size):
+        """A filter of high order makes white what is left of a line between two frequencies."""
+
+        def line(t, mean, u):
+            angle = 2.0 * np.pi * t / 11.83
+            return size * (np.sin(angle) + 0.4 * np.sin(2.0 * angle + 1.0))
+
+        found = periodic_disturbance(residuals(7, 750, pole=0.0, effect=line))
+        assert found.p_value < 1e-9
+        assert found.gain > 0.3 * 375 * np.log(1.0 + 0.58 * size**2)
+        assert found.where["period"] == pytest.approx(11.83, rel=2e-3)
+
     def test_period_is_found(self):
         found = [periodic_disturbance(residuals(s, 500, effect=sine), seed=s) for s in range(2, 6)]
         assert np.median([e.p_value for e in found]) < 0.01
@@ -200,6 +213,15 @@ class TestCalendar:
         assert found.p_value < 1e-3
         assert found.where["what"] == "turn of the year"
         assert "least at" in found.sentence
+
+    def test_the_clock_of_the_stamps_is_named_where_others_tell_no_better(self):
+        """Where the weekend begins says the zone, but at night nobody works."""
+        clock = pd.date_range("2024-03-04", periods=1000, freq="30min", tz="Europe/Berlin")
+        at_work = np.asarray((clock.hour >= 8) & (clock.hour < 18) & (clock.day_of_week < 5))
+        for seed in (1, 3, 5):
+            r = residuals(seed, 1000, step=1.0, stamps=clock, effect=lambda *_: 1.5 * at_work)
+            (found,) = calendar(r, zones=("America/Santiago", "UTC"))
+            assert found.where["zone"] == "Europe/Berlin"
 
     def test_what_repeats_every_week_does_not_hide_the_turn_of_the_year(self):
         clock = pd.date_range("2020-01-01", periods=1100, freq="D", tz="UTC")

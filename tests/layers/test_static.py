@@ -168,8 +168,15 @@ class TestPyro:
         y = x.square() - 1.0 + 0.1 * normal(30)
         with pyro.get_param_store().scope(), torch.random.fork_rng():
             pyro.set_rng_seed(0)
-            # A layer in the middle of a model has its residual in the guide, a last one its values.
-            guide = AutoNormal(self.model, init_scale=0.05)
+            # A layer in the middle of a model has its residual in the guide; a last one has, given
+            # the other sites, the same conditional as in the model.
+            others = AutoNormal(pyro.poutine.block(self.model, hide=["f"]), init_scale=0.05)
+
+            def guide(x, y, pathwise):
+                given = pyro.condition(self.model, data=others(x, y, pathwise=pathwise))
+                if not pathwise:
+                    pyro.poutine.block(given, expose=["f"])(x, y, pathwise=pathwise)
+
             elbo = TraceMeanField_ELBO(
                 num_particles=4, vectorize_particles=True, max_plate_nesting=0
             )
