@@ -49,8 +49,10 @@ class Replacement(Channel):
 class Delayed(Replacement):
     """An input that arrives later: u(t - delay), held between samples, averaged over each step.
 
-    Before the record its first value is held. Exact for whole numbers of steps; between them right
-    for systems that are slow beside a step.
+    Before the record its first value is held, which is not what acted then: `close_loop` takes
+    outputs for missing until the first input of the record has arrived, and in a record for `fit`
+    they had better be NaN. Exact for whole numbers of steps; between them right for systems that
+    are slow beside a step.
 
     Args:
         channel: name of the input. delay: [time unit], may be a fraction of a step.

@@ -8,7 +8,7 @@ from pyro_dynogp.channels import Channel, count_direct
 from pyro_dynogp.inference.cascade_fit import deterministic
 from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.models.cascade import Cascade
-from pyro_dynogp.models.layers import Dynamic, Static
+from pyro_dynogp.models.layers import Dynamic, Limits, Static
 from pyro_dynogp.models.linear import LinearDynamicGP
 
 Model = LinearDynamicGP | Cascade
@@ -101,9 +101,7 @@ def as_cascade(model: Model) -> Cascade:
     )
 
 
-def with_output_function(
-    model: Model, limits: tuple[float | None, float | None] | None = None
-) -> Model | None:
+def with_output_function(model: Model, limits: Limits | None = None) -> Model | None:
     """The model with a static layer after its last dynamic one; None where there is one already.
 
     Its prior mean is a straight line, to which it goes back beyond the data; or one that stops at

@@ -13,6 +13,7 @@ from pyro_dynogp.criticism.posterior_draws import draws_of, with_draws
 from pyro_dynogp.discrepancy.evidence import Residuals
 from pyro_dynogp.discrepancy.known_inputs import longest_delay, unknown_beginning
 from pyro_dynogp.models.cascade import Cascade
+from pyro_dynogp.models.limits import at_limits
 from pyro_dynogp.record import Record
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ def residuals_of(
     y[: unknown + settling(fit, record)] = np.nan
     innovations = fit.innovations(prepared)[:, output]
     if isinstance(fit.model, Cascade):  # a sensor at its limit says nothing of the error there
-        stopped = fit.model.at_limits(prepared)
+        stopped = at_limits(fit.model.layers, prepared)
         y[stopped], innovations = np.nan, np.where(stopped, np.nan, innovations)
     return Residuals(
         time=record.time,

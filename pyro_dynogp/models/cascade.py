@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 
-import numpy as np
 import pyro
 import pyro.distributions as dist
 import torch
@@ -21,6 +19,7 @@ from pyro_dynogp.layers.static import sample_static
 from pyro_dynogp.models.collapsed import observe_collapsed
 from pyro_dynogp.models.explicit import observe_explicit
 from pyro_dynogp.models.layers import Dynamic, Layer, Static, Wire, wire
+from pyro_dynogp.models.limits import at_limits, count_as_probabilities, scaled_limits
 from pyro_dynogp.models.linear import (
     check_direct,
     check_records,
@@ -221,7 +220,7 @@ class Cascade:
             learn_locations=layer.learn_locations,
         )
         if layer.limits is not None:
-            function = replace(function, limits=_scaled_limits(layer.limits, scaling))
+            function = replace(function, limits=scaled_limits(layer.limits, scaling))
         if not one.pathwise or self.integrate == "all":
             return StaticSystem(function)
         one_ = torch.ones(layer.outputs, layer.support, dtype=torch.float64)
@@ -245,30 +244,7 @@ class Cascade:
             else:
                 last = self.integrate == "last"
                 observe_explicit(here, scaling, record, suffix, u, last_integrated=last)
-            self._count_limits(here, record, suffix, u)
-
-    def at_limits(self, record: Record) -> np.ndarray:
-        """Where the output (n,) is exactly at a limit of the last layer."""
-        last = self.layers[-1]
-        if not isinstance(last, Static) or last.limits is None or not record.n_outputs:
-            return np.zeros(len(record), dtype=bool)
-        known = [one for one in last.limits if one is not None]
-        there: np.ndarray = np.isin(record.outputs[:, 0], known)
-        return there
-
-    def _count_limits(
-        self, system: CascadeSystem, record: Record, suffix: str, inputs: Tensor
-    ) -> None:
-        """Take samples that are exactly at a sensor's limit for what they are: probabilities.
-
-        Their density, which has no upper bound where the noise vanishes, times sqrt(2 pi) times the
-        noise's scale is at most one, as the probability of being beyond the limit is.
-        """
-        at = self.at_limits(record)
-        if at.any():
-            sd = system.noise_sd(inputs, record.time)[..., 0]
-            sd = sd.expand((*sd.shape[:-1], len(at)))[..., torch.as_tensor(at)]
-            pyro.factor(f"at_limits{suffix}", (sd.log() + 0.5 * math.log(2.0 * math.pi)).sum(-1))
+            count_as_probabilities(at_limits(self.layers, record), here, record, suffix, u)
 
     def sample_states(self, suffix: str) -> dict[str, Tensor]:
         """Sample what past inputs left at the first sample of a record, by layer."""
@@ -290,23 +266,6 @@ class Cascade:
             }
             return system.after(zeros)
         return system.after(states)
-
-
-def _scaled_limits(
-    limits: tuple[float | None, float | None], scaling: Scaling | None
-) -> tuple[float, float]:
-    """Limits of the (single) output in scaled units, infinite where there is none."""
-    if scaling is None:
-        raise invalid(
-            "scaling", expected="that of the training record, for a layer with limits",
-            got="None", advice="Use model.scaled_to(record).",
-        )  # fmt: skip
-    low, high = (
-        sign * math.inf if one is None
-        else (one - float(scaling.output_offset[0])) / float(scaling.output_scale[0])
-        for one, sign in zip(limits, (-1.0, 1.0), strict=True)
-    )  # fmt: skip
-    return low, high
 
 
 def support_points(locations: Tensor, count: int) -> Tensor:

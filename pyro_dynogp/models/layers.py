@@ -10,6 +10,8 @@ from pyro_dynogp._errors import invalid
 from pyro_dynogp.lti.modes import NoiseStructure
 
 INPUTS = "inputs"
+# Lowest and highest value, None where there is none.
+Limits = tuple[float | None, float | None]
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ class Static:
     inducing: int = 32
     kernel: Any = None
     mean: Literal["constant", "linear"] | None = None
-    limits: tuple[float | None, float | None] | None = None
+    limits: Limits | None = None
     skip: tuple[str, ...] = ()
     learn_locations: bool = True
     support: int = 64

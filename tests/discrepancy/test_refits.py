@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import pyro_dynogp as dgp
-from pyro_dynogp.channels import Delayed, Recorded
+from pyro_dynogp.channels import Delayed, Recorded, Trend
 from pyro_dynogp.discrepancy import effects, refits
 from pyro_dynogp.discrepancy.extend import as_cascade, with_channel, without_process_noise
 from pyro_dynogp.discrepancy.refits import energy, quick_fit, race
@@ -111,3 +111,25 @@ def test_a_variant_is_tried_for_one_channel_only():
     assert len(others) < len(some)
     assert not {repr(one) for one in some} & {repr(one) for one in others}
     assert len(candidates_of([first, first], model, data, 0.05, 8)) == 1
+
+
+def test_a_saturation_knows_its_limits_and_a_function_goes_on_as_a_line():
+    where = {"low": -np.inf, "high": 0.7}
+    record = dgp.Record(STEP * np.arange(5), np.zeros((5, 1)), np.zeros((5, 1)))
+    limits = spoken_for(effects.Saturation(), 1e-9, 1e-8, **where).evidence
+    curve = spoken_for(effects.OutputNonlinearity(), 1e-9, 1e-8).evidence
+
+    def last(effect, model, evidence):
+        (extended,) = effect.extend(model, evidence, record)
+        return extended.layers[-1]
+
+    stops = last(effects.Saturation(), MODEL, limits)
+    assert (stops.mean, stops.limits) == ("linear", (None, 0.7))
+    bends = last(effects.OutputNonlinearity(), MODEL, curve)
+    assert (bends.mean, bends.limits) == ("linear", None)
+    # Which output they are of is not known, or something comes on top of the sensor.
+    for model in (
+        replace(MODEL, outputs=2),
+        with_channel(MODEL, Trend(0.0, 1.0)),
+    ):
+        assert last(effects.Saturation(), model, limits).limits is None

@@ -13,6 +13,7 @@ from scipy.stats import norm
 
 import pyro_dynogp as dgp
 from pyro_dynogp.models.layers import Dynamic, Static
+from pyro_dynogp.models.limits import at_limits
 from tests.models.cascades import (
     MODELS,
     SMALL,
@@ -369,7 +370,7 @@ def test_outputs_at_a_limit_are_probabilities(integrate):
     given = dgp.Static(inducing=4, mean="linear", limits=(None, top))
     model = replace(model, layers=(model.layers[0], given), integrate=integrate)
     model = model.scaled_to(record)
-    assert model.at_limits(stopped).sum() == 6
+    assert at_limits(model.layers, stopped).sum() == 6
     trace = draw(model, stopped)
     count = 6 * (trace.nodes["noise_sd"]["value"].log() + 0.5 * math.log(2.0 * math.pi))
     assert trace.nodes["at_limits"]["fn"].log_factor.item() == pytest.approx(

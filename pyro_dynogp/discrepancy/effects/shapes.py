@@ -65,7 +65,9 @@ class Saturation(Effect):
         low, high = (
             at if np.isfinite(at := number_of(evidence, end)) else None for end in ("low", "high")
         )
-        if model.outputs > 1:  # which of them the limits are of is not said
+        # Which of several outputs the limits are of is not said, and what acts on the output
+        # directly comes on top of the sensor.
+        if model.outputs > 1 or model.direct:
             low = high = None
         limits = None if low is None and high is None else (low, high)
         extended = with_output_function(model, limits)
