@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pyro_dynogp.discrepancy.evidence import Residuals
+from pyro_dynogp.discrepancy.looking import unit
 from pyro_dynogp.record import Record
 
 # A run of equal values is suspect where chance makes as long a one in one record of a thousand,
@@ -84,8 +85,9 @@ def data_spikes(residuals: Residuals) -> Fault | None:
         return None
     largest = spiking[int(np.argmax(np.abs(off[spiking - 1])))]
     text = (
-        f"{r.output_name!r} has {len(spiking)} spikes of one sample, the largest of "
-        f"{off[largest - 1]:.3g} {r.output_unit} at {r.time[largest]:.5g} {r.time_unit}."
+        f"{r.output_name!r} has {len(spiking)} spike{'s' if len(spiking) > 1 else ''} of one "
+        f"sample, the largest of {off[largest - 1]:.3g}{unit(r.output_unit)} at "
+        f"{r.time[largest]:.5g}{unit(r.time_unit)}."
     )
     return Fault("spike", r.output_name, spiking, text)
 

@@ -52,6 +52,12 @@ def test_spike() -> None:
     fault = data_spikes(replace(r, output=y))
     assert fault is not None
     assert list(fault.samples) == [400]
+    assert "has 1 spike of one sample" in fault.sentence
+    y[300] += 40.0
+    several = data_spikes(replace(r, output=y, output_unit=""))
+    assert several is not None
+    assert "has 2 spikes of one sample" in several.sentence
+    assert "  " not in several.sentence
 
 
 def test_coarse_sensor_is_not_stuck() -> None:
