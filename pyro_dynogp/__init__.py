@@ -6,7 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pyro_dynogp import datasets, plotting
+    from pyro_dynogp import plotting
     from pyro_dynogp.criticism.calibration import Calibration, calibration
     from pyro_dynogp.criticism.check import Check, check
     from pyro_dynogp.criticism.comparison import Comparison, Stack, compare, stack
@@ -16,11 +16,14 @@ if TYPE_CHECKING:
     from pyro_dynogp.criticism.pyro_posterior import PyroPosterior
     from pyro_dynogp.criticism.rank_results import SimulationBasedCalibration
     from pyro_dynogp.criticism.simulation_based import simulation_based_calibration
+    from pyro_dynogp.data.record import Record
+    from pyro_dynogp.data.scaling import Scaling
     from pyro_dynogp.distributions.conditioned import ConditionedLTIProcess
     from pyro_dynogp.distributions.decay import LogDecayRate
     from pyro_dynogp.distributions.inducing import InducingLTIProcess, inducing_times
     from pyro_dynogp.distributions.process import LTIProcess, ObservedLTIProcess
     from pyro_dynogp.distributions.reparam import InnovationReparam
+    from pyro_dynogp.examples import datasets
     from pyro_dynogp.gp import LTIKernel, LTIMean, LTIParameters
     from pyro_dynogp.guides.families import (
         Family,
@@ -33,9 +36,9 @@ if TYPE_CHECKING:
     )
     from pyro_dynogp.guides.layer_guide import LayerGuide
     from pyro_dynogp.inference.fit import fit
-    from pyro_dynogp.inference.result import Fit
+    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.inference.methods.svi import TrainingDivergedError
     from pyro_dynogp.inference.storage import load
-    from pyro_dynogp.inference.svi import TrainingDivergedError
     from pyro_dynogp.layers.functions import StaticFunction
     from pyro_dynogp.layers.noise import Gaussian, Heteroscedastic, Likelihood, StudentT
     from pyro_dynogp.layers.static import sample_static, static_gp
@@ -47,30 +50,28 @@ if TYPE_CHECKING:
         Wiener,
         WienerHammerstein,
     )
-    from pyro_dynogp.models.cascade import Cascade
-    from pyro_dynogp.models.collapsed import ObservedCascade
-    from pyro_dynogp.models.layers import Dynamic, Static
     from pyro_dynogp.models.linear import LinearDynamicGP
+    from pyro_dynogp.models.model import Cascade
+    from pyro_dynogp.models.outputs import ObservedCascade
     from pyro_dynogp.models.priors import TimeScale, sample_modes
-    from pyro_dynogp.models.systems import CascadeSystem
+    from pyro_dynogp.models.system import CascadeSystem
+    from pyro_dynogp.models.wiring import Dynamic, Static
     from pyro_dynogp.prediction.prediction import Prediction
     from pyro_dynogp.prediction.scores import scores
-    from pyro_dynogp.record import Record
-    from pyro_dynogp.scaling import Scaling
 
 __version__ = "0.1.0"
 
 # Names are imported when they are first used (PEP 562), so that the command line answers at once.
 _HOME = {
     "Calibration": "pyro_dynogp.criticism.calibration",
-    "Cascade": "pyro_dynogp.models.cascade",
-    "CascadeSystem": "pyro_dynogp.models.systems",
+    "Cascade": "pyro_dynogp.models.model",
+    "CascadeSystem": "pyro_dynogp.models.system",
     "Check": "pyro_dynogp.criticism.check",
     "Comparison": "pyro_dynogp.criticism.comparison",
     "ConditionedLTIProcess": "pyro_dynogp.distributions.conditioned",
-    "Dynamic": "pyro_dynogp.models.layers",
+    "Dynamic": "pyro_dynogp.models.wiring",
     "Family": "pyro_dynogp.guides.families",
-    "Fit": "pyro_dynogp.inference.result",
+    "Fit": "pyro_dynogp.inference.fitted",
     "FullRank": "pyro_dynogp.guides.families",
     "GaussMarkov": "pyro_dynogp.guides.families",
     "Gaussian": "pyro_dynogp.layers.noise",
@@ -91,22 +92,22 @@ _HOME = {
     "MeanField": "pyro_dynogp.guides.families",
     "ModalState": "pyro_dynogp.lti.state",
     "Modes": "pyro_dynogp.lti.modes",
-    "ObservedCascade": "pyro_dynogp.models.collapsed",
+    "ObservedCascade": "pyro_dynogp.models.outputs",
     "ObservedLTIProcess": "pyro_dynogp.distributions.process",
     "Point": "pyro_dynogp.guides.families",
     "Prediction": "pyro_dynogp.prediction.prediction",
     "PredictiveChecks": "pyro_dynogp.criticism.predictive_checks",
     "PyroPosterior": "pyro_dynogp.criticism.pyro_posterior",
-    "Record": "pyro_dynogp.record",
+    "Record": "pyro_dynogp.data.record",
     "SameAsPrior": "pyro_dynogp.guides.families",
-    "Scaling": "pyro_dynogp.scaling",
+    "Scaling": "pyro_dynogp.data.scaling",
     "SimulationBasedCalibration": "pyro_dynogp.criticism.rank_results",
     "Stack": "pyro_dynogp.criticism.comparison",
-    "Static": "pyro_dynogp.models.layers",
+    "Static": "pyro_dynogp.models.wiring",
     "StaticFunction": "pyro_dynogp.layers.functions",
     "StudentT": "pyro_dynogp.layers.noise",
     "TimeScale": "pyro_dynogp.models.priors",
-    "TrainingDivergedError": "pyro_dynogp.inference.svi",
+    "TrainingDivergedError": "pyro_dynogp.inference.methods.svi",
     "Wiener": "pyro_dynogp.models.architectures",
     "WienerHammerstein": "pyro_dynogp.models.architectures",
     "calibration": "pyro_dynogp.criticism.calibration",
@@ -126,7 +127,7 @@ _HOME = {
     "stack": "pyro_dynogp.criticism.comparison",
     "static_gp": "pyro_dynogp.layers.static",
 }
-_MODULES = ("datasets", "plotting")
+_MODULES = {"datasets": "pyro_dynogp.examples.datasets", "plotting": "pyro_dynogp.plotting"}
 
 __all__ = [
     "Calibration",
@@ -199,7 +200,7 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name in _MODULES:
-        value: Any = importlib.import_module(f"pyro_dynogp.{name}")
+        value: Any = importlib.import_module(_MODULES[name])
     elif name in _HOME:
         value = getattr(importlib.import_module(_HOME[name]), name)
     else:

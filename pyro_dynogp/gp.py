@@ -8,11 +8,11 @@ import gpytorch
 import torch
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp._tensors import as_tensor
 from pyro_dynogp.lti.covariance import autocovariance
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import hold, mean_response
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.tensors import as_tensor
 
 
 class LTIParameters(gpytorch.Module):

@@ -12,9 +12,9 @@ import pytest
 from click.testing import CliRunner
 
 import pyro_dynogp as dgp
-from pyro_dynogp import datasets, demo
-from pyro_dynogp.cli import main
+from pyro_dynogp.cli import demo, main
 from pyro_dynogp.cli.data import DATASETS
+from pyro_dynogp.examples import datasets
 
 QUICK = ["--pairs", "1", "--restarts", "1", "--steps", "15", "--workers", "1", "--quiet"]
 COLUMNS = ["--input", "valve", "--output", "level", "--sampling-time", "0.5"]

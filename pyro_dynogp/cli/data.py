@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
-    from pyro_dynogp.datasets import Dataset
-    from pyro_dynogp.inference.result import Fit
-    from pyro_dynogp.record import Record
+    from pyro_dynogp.data.record import Record
+    from pyro_dynogp.examples.datasets import Dataset
+    from pyro_dynogp.inference.fitted import Fit
 
 # One line for each shipped data set; `pyro-dynogp info NAME` tells the rest.
 DATASETS = {
@@ -113,7 +113,7 @@ def record_for(fitted: Fit, data: str, clock: dict[str, Any]) -> tuple[Record, b
         fitted: the fit, in whose units the columns of a file are taken to be.
         data: file or name of a data set. clock: options of `Record.from_csv` about time.
     """
-    from pyro_dynogp._text_table import read_table
+    from pyro_dynogp.data.text_table import read_table
 
     scaling = fitted.scaling
     if data in DATASETS:
@@ -189,7 +189,7 @@ def _numeric(path: Path, used: tuple[str | None, ...]) -> tuple[tuple[str, ...],
     """Other columns of a file: those that hold numbers, and those that hold text or nothing."""
     import numpy as np
 
-    from pyro_dynogp._text_table import read_table
+    from pyro_dynogp.data.text_table import read_table
 
     table = read_table(path, None, None, None, None, "utf-8-sig")
     kept: list[str] = []
@@ -213,7 +213,7 @@ def _from_csv(
     extra: tuple[str, ...] = (),
     **units: Any,
 ) -> Record:
-    from pyro_dynogp.record import Record
+    from pyro_dynogp.data.record import Record
 
     # The reader complains likewise, but in terms of Python arguments.
     if (clock["time"] is None) == (clock["sampling_time"] is None):
@@ -246,7 +246,7 @@ def _refuse(data: str, options: dict[str, Any]) -> None:
 
 def _selected(name: str, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> Dataset:
     """Data set with the given channels, or with its own where none are given."""
-    from pyro_dynogp import datasets
+    from pyro_dynogp.examples import datasets
 
     def chosen(record: Record) -> Record:
         return record.select(inputs=inputs or None, outputs=outputs or None)

@@ -42,7 +42,7 @@ def _is_safetensors(path: Path) -> bool:
 
 
 def _tell_dataset(name: str) -> None:
-    from pyro_dynogp import datasets
+    from pyro_dynogp.examples import datasets
 
     data = datasets.load(name)
     click.echo(f"{name}: {DATASETS[name]}\nSource: {data.source}\nProtocol: {data.protocol}")
@@ -72,7 +72,7 @@ def _tell_fit(path: Path) -> None:
 def _tell_columns(path: Path) -> None:
     import numpy as np
 
-    from pyro_dynogp._text_table import read_table
+    from pyro_dynogp.data.text_table import read_table
 
     table = read_table(path, None, None, None, None, "utf-8-sig")
     click.echo(f"{path}: {len(table.lines)} rows, {len(table.columns)} columns")

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp.criticism._crps import CrpsDecomposition, decomposition
-from pyro_dynogp.criticism._pairing import Pair, paired
-from pyro_dynogp.criticism._pit import LEVELS, NOMINAL, PitCurves, pit_curves
+from pyro_dynogp.criticism.crps import CrpsDecomposition, decomposition
+from pyro_dynogp.criticism.pairing import Pair, paired
+from pyro_dynogp.criticism.probability_integral import LEVELS, NOMINAL, PitCurves, pit_curves
+from pyro_dynogp.data.record import Record
 from pyro_dynogp.prediction.prediction import Prediction
-from pyro_dynogp.record import Record
+from pyro_dynogp.support.errors import invalid
 
 # Enough for p-values in steps of 0.2 %; more would cost time in proportion.
 MOST_SAMPLES = 500

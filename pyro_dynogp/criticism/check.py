@@ -9,15 +9,15 @@ import numpy as np
 import pyro
 import torch
 
-from pyro_dynogp._errors import invalid
 from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.calibration import calibration
 from pyro_dynogp.criticism.finding import Finding, apart
 from pyro_dynogp.criticism.posterior_draws import DRAWS, PosteriorDraws, draws_of, log_joint_of
 from pyro_dynogp.criticism.twin import twin_findings
+from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.result import Fit
+    from pyro_dynogp.inference.fitted import Fit
 
 # Largest R-hat and fewest effective draws of chains that have mixed (Vehtari et al. 2021).
 R_HAT, EFFECTIVE = 1.01, 400

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from pyro_dynogp._errors import invalid
 from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.loo import Target, loo
+from pyro_dynogp.data.record import Record
 from pyro_dynogp.prediction.prediction import Parts, Prediction
-from pyro_dynogp.record import Record
+from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.result import Fit
+    from pyro_dynogp.inference.fitted import Fit
 
 # Differences of total elpd below this are small whatever their standard error (Vehtari's
 # cross-validation FAQ), and so many standard errors make one clear.

@@ -20,14 +20,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
 from pyro_dynogp.distributions.process import ObservedLTIProcess
 from pyro_dynogp.distributions.trajectory import apply, split_missing
 from pyro_dynogp.lti.filtering import predict_k_steps
 from pyro_dynogp.models.assembly import assemble
-from pyro_dynogp.models.collapsed import ObservedCascade
+from pyro_dynogp.models.outputs import ObservedCascade
 from pyro_dynogp.moments import filtering, smoothing
 from pyro_dynogp.moments.problem import each
+from pyro_dynogp.support.errors import invalid
 
 Kind = Literal["missing sample", "forecast"]
 

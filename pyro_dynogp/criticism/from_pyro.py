@@ -11,7 +11,6 @@ import pyro
 import torch
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
 from pyro_dynogp.criticism.pyro_draws import (
     Nodes,
     deterministic_nodes,
@@ -21,7 +20,8 @@ from pyro_dynogp.criticism.pyro_draws import (
 )
 from pyro_dynogp.criticism.pyro_posterior import PyroPosterior
 from pyro_dynogp.criticism.site_densities import is_masked, is_trajectory
-from pyro_dynogp.parallel import seeded
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.parallel import seeded
 
 __all__ = ["PyroPosterior", "from_pyro"]
 

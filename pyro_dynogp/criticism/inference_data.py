@@ -14,7 +14,6 @@ import xarray as xr
 from torch import Tensor
 
 import pyro_dynogp
-from pyro_dynogp._errors import invalid
 from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.labelled import Coordinate, Variable, clock_of, dataset_of, units_of
 from pyro_dynogp.criticism.physical import physical_quantities
@@ -26,16 +25,17 @@ from pyro_dynogp.criticism.site_dimensions import (
     suffixes_of,
 )
 from pyro_dynogp.criticism.subjects import densities_at
-from pyro_dynogp.inference.guides import MixtureGuide
-from pyro_dynogp.models.cascade import Cascade
-from pyro_dynogp.models.collapsed import collapsed_of
-from pyro_dynogp.parallel import seeded
-from pyro_dynogp.prediction.beginning import beginning
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.inference.posteriors import MixtureGuide
+from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.models.outputs import collapsed_of
+from pyro_dynogp.prediction.first_state import beginning
 from pyro_dynogp.prediction.linear import prior_process
-from pyro_dynogp.record import Record
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.parallel import seeded
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.result import Fit
+    from pyro_dynogp.inference.fitted import Fit
 
 NOT_FOR_LOO = (
     "One-step-ahead densities p(y_i | outputs before y_i, draw), trajectories integrated out: they "

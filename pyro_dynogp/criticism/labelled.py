@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp.record import Record
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.support.errors import invalid
 
 # Labels of a dimension: (dimension, values, attributes), as xarray takes them.
 Coordinate = tuple[str, np.ndarray, Mapping[str, str]]

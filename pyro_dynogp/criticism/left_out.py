@@ -17,10 +17,10 @@ import numpy as np
 from scipy.special import logsumexp
 from tqdm import trange
 
-from pyro_dynogp._errors import invalid
 from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.subjects import Subject
-from pyro_dynogp.parallel import parallel_map
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.parallel import parallel_map
 
 
 @dataclass(frozen=True, eq=False)

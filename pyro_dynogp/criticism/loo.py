@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
-from pyro_dynogp._errors import invalid
 from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.left_out import Found, forecast, missing_sample, new_record
 from pyro_dynogp.criticism.posterior_draws import DRAWS
 from pyro_dynogp.criticism.subjects import FitSubject, Parameters, Subject
-from pyro_dynogp.record import Record, as_records
+from pyro_dynogp.data.record import Record, as_records
+from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.result import Fit
+    from pyro_dynogp.inference.fitted import Fit
 
 Target = Literal["missing sample", "forecast", "new record"]
 TARGETS = get_args(Target)
@@ -106,7 +106,7 @@ def subject_of(
     progress: bool = False,
 ) -> Subject:
     """What `loo` works on."""
-    from pyro_dynogp.inference.result import Fit
+    from pyro_dynogp.inference.fitted import Fit
 
     if not isinstance(fit, Fit):
         if not all(hasattr(fit, name) for name in ("draws", "pointwise", "places", "data")):

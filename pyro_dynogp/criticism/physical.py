@@ -13,15 +13,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pyro_dynogp._tensors import as_tensor
 from pyro_dynogp.criticism.labelled import Variable, ratio_units, units_of
 from pyro_dynogp.criticism.site_dimensions import Place, places_of
+from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.lti.modes import Modes
-from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.linear import LinearDynamicGP
+from pyro_dynogp.models.model import Cascade
 from pyro_dynogp.models.priors import numerators
-from pyro_dynogp.models.systems import CascadeSystem, DynamicSystem
-from pyro_dynogp.scaling import Scaling
+from pyro_dynogp.models.system import CascadeSystem, DynamicSystem
+from pyro_dynogp.support.tensors import as_tensor
 
 
 def physical_quantities(

@@ -13,20 +13,20 @@ import torch
 from scipy.special import logsumexp
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
 from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.finding import apart
 from pyro_dynogp.criticism.kept_draws import kept
-from pyro_dynogp.inference import annealing
-from pyro_dynogp.inference.guides import GaussianGuide, MixtureGuide, gaussian_guide
-from pyro_dynogp.inference.potential import Potential, log_prob_by_draw
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.inference.density import Potential, log_prob_by_draw
+from pyro_dynogp.inference.methods import annealed as annealing
+from pyro_dynogp.inference.posteriors import GaussianGuide, MixtureGuide, gaussian_guide
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
-from pyro_dynogp.models.cascade import Cascade
-from pyro_dynogp.parallel import seeded
-from pyro_dynogp.record import Record
+from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.parallel import seeded
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.result import Fit
+    from pyro_dynogp.inference.fitted import Fit
 
 Values = Mapping[str, Tensor]
 # Draws that `check` and `loo` take where they are not told: the same, so that their k agree.

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp.criticism._envelope import envelope
-from pyro_dynogp.criticism._pairing import Pair, paired
+from pyro_dynogp.criticism.envelope import envelope
+from pyro_dynogp.criticism.pairing import Pair, paired
 from pyro_dynogp.criticism.statistics import STATISTICS, Statistic, unit
+from pyro_dynogp.data.record import Record
 from pyro_dynogp.prediction.prediction import Prediction
-from pyro_dynogp.record import Record
+from pyro_dynogp.support.errors import invalid
 
 FALSE_ALARM = 0.05
 

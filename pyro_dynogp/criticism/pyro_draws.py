@@ -10,9 +10,9 @@ import pyro
 import torch
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
 from pyro_dynogp.criticism.posterior_draws import PosteriorDraws
-from pyro_dynogp.inference.guides import DrawsGuide, MixtureGuide
+from pyro_dynogp.inference.posteriors import DrawsGuide, MixtureGuide
+from pyro_dynogp.support.errors import invalid
 
 Nodes = dict[str, Any]
 

@@ -13,7 +13,6 @@ import xarray as xr
 from torch import Tensor
 
 import pyro_dynogp
-from pyro_dynogp._errors import invalid
 from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.densities import Kind
 from pyro_dynogp.criticism.inference_data import NOT_FOR_LOO, pareto_attrs
@@ -27,7 +26,8 @@ from pyro_dynogp.criticism.site_densities import (
 )
 from pyro_dynogp.criticism.site_dimensions import dimensions_for
 from pyro_dynogp.criticism.subjects import Subject, fingerprint_of, no_refit
-from pyro_dynogp.parallel import seeded
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.parallel import seeded
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from types import MappingProxyType
 import numpy as np
 import pandas as pd
 
-from pyro_dynogp.criticism._ranks import Uniformity, holm, uniformity
+from pyro_dynogp.criticism.ranks import Uniformity, holm, uniformity
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,18 +12,18 @@ import pyro
 import torch
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp.criticism._ranks import rank_of
 from pyro_dynogp.criticism.posterior_draws import draws_of, log_joint
 from pyro_dynogp.criticism.rank_results import SimulationBasedCalibration, judged
+from pyro_dynogp.criticism.ranks import rank_of
+from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.fit import fit
-from pyro_dynogp.models.cascade import Cascade
 from pyro_dynogp.models.linear import LinearDynamicGP
-from pyro_dynogp.parallel import child_seeds, parallel_map, seeded
-from pyro_dynogp.record import Record
+from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.parallel import child_seeds, parallel_map, seeded
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.result import Fit
+    from pyro_dynogp.inference.fitted import Fit
 
 Model = LinearDynamicGP | Cascade
 JOINT = "log joint"

@@ -12,7 +12,7 @@ from torch import Tensor
 from pyro_dynogp.criticism.densities import Kind, pointwise_log_density
 from pyro_dynogp.distributions.process import ObservedLTIProcess
 from pyro_dynogp.distributions.trajectory import Trajectory
-from pyro_dynogp.models.collapsed import ObservedCascade
+from pyro_dynogp.models.outputs import ObservedCascade
 
 AROUND = (torch.distributions.Independent, dist.MaskedDistribution, dist.ExpandedDistribution)
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from pyro_dynogp.criticism.labelled import Coordinate, clock_of
-from pyro_dynogp.models.cascade import Cascade
-from pyro_dynogp.models.layers import INPUTS, Dynamic, Layer
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.models.linear import LinearDynamicGP
-from pyro_dynogp.record import Record
-from pyro_dynogp.scaling import Scaling
+from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.models.wiring import INPUTS, Dynamic, Layer
 
 # The two numbers of a gain (see `sample_modes`), and of a complex number.
 TERM = ("derivative", "steady state")

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 import numpy as np
 import torch
 
-from pyro_dynogp._errors import invalid
 from pyro_dynogp.criticism.densities import Kind, pointwise_log_density
 from pyro_dynogp.criticism.posterior_draws import (
     AT_ONCE,
@@ -20,14 +19,15 @@ from pyro_dynogp.criticism.posterior_draws import (
     draws_of,
     with_draws,
 )
+from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.refit import refit
-from pyro_dynogp.models.cascade import Cascade
-from pyro_dynogp.models.collapsed import collapsed_of
+from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.models.outputs import collapsed_of
 from pyro_dynogp.prediction.linear import prior_process, process_given
-from pyro_dynogp.record import Record
+from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.result import Fit
+    from pyro_dynogp.inference.fitted import Fit
 
 
 Parameters = Literal["posterior", "mode"]

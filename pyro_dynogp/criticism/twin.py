@@ -12,16 +12,16 @@ import torch
 from pyro.ops.stats import split_gelman_rubin
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
 from pyro_dynogp.criticism.finding import Finding, apart
 from pyro_dynogp.criticism.posterior_draws import draws_of, log_joint, with_draws
-from pyro_dynogp.inference.potential import Potential
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.methods.nuts import Chains, sample_posterior
 from pyro_dynogp.inference.refit import refit
-from pyro_dynogp.inference.sampling import Chains, sample_posterior
-from pyro_dynogp.record import Record
+from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.result import Fit
+    from pyro_dynogp.inference.fitted import Fit
 
 FEWEST = 20
 # What is good enough. A mean that is off by 0.2 sd, or an sd by a factor 1.2, costs 0.02 nats of a

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pyro_dynogp._errors import invalid
+from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.data_faults import Fault, faults, without_stuck
-from pyro_dynogp.prediction.clock import gap_between, joined
-from pyro_dynogp.record import Record
+from pyro_dynogp.prediction.records import gap_between, joined
+from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.result import Fit
+    from pyro_dynogp.inference.fitted import Fit
 
 # Fewest samples of the blocks B and C, and fewest of them that were measured.
 FEWEST, MEASURED = 60, 30

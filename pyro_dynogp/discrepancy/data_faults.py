@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pyro_dynogp.discrepancy.evidence import Residuals
-from pyro_dynogp.discrepancy.looking import unit
-from pyro_dynogp.record import Record
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.statistics.detecting import unit
+from pyro_dynogp.statistics.evidence import Residuals
 
 # A run of equal values is suspect where chance makes as long a one in one record of a thousand,
 # and it is so many times as long as nearly all others.

@@ -6,25 +6,25 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pyro_dynogp._errors import invalid
+from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.blocks import blocks_of
-from pyro_dynogp.discrepancy.course import Course
-from pyro_dynogp.discrepancy.effects import CATALOGUE, Effect
-from pyro_dynogp.discrepancy.extend import has_function, used_channels
-from pyro_dynogp.discrepancy.known_inputs import longest_delay, where_inputs_are_known
 from pyro_dynogp.discrepancy.refits import poles_of, quick_fit
 from pyro_dynogp.discrepancy.report import Report
 from pyro_dynogp.discrepancy.reporting import report_of
 from pyro_dynogp.discrepancy.rounds import Rounds, Stopwatch
+from pyro_dynogp.discrepancy.state import Course
 from pyro_dynogp.discrepancy.trials import without
+from pyro_dynogp.effects import CATALOGUE, Effect
 from pyro_dynogp.inference.fit import fit as fit_model
-from pyro_dynogp.inference.result import Method
-from pyro_dynogp.models.cascade import Cascade
-from pyro_dynogp.parallel import one_thread, parallel_map
-from pyro_dynogp.record import Record
+from pyro_dynogp.inference.fitted import Method
+from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
+from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.models.variants import has_function, used_channels
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.parallel import one_thread, parallel_map
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.result import Fit
+    from pyro_dynogp.inference.fitted import Fit
 
 # Fresh starts of the last fits, of linear models and of cascades.
 LAST_LINEAR_STARTS, LAST_CASCADE_STARTS = 2, 1

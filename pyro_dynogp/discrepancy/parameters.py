@@ -9,21 +9,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 from torch import Tensor
 
-from pyro_dynogp.channels import Channel, Delayed, Quantity, count_direct, prepared
-from pyro_dynogp.channels.base import unit_of
 from pyro_dynogp.criticism.posterior_draws import draws_of
-from pyro_dynogp.discrepancy.known_inputs import where_inputs_are_known
-from pyro_dynogp.inference.number import Number, number_posterior
-from pyro_dynogp.inference.potential import Potential
+from pyro_dynogp.data.channels import Channel, Delayed, Quantity, count_direct, prepared
+from pyro_dynogp.data.channels.base import unit_of
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.methods.numbers import Number, number_posterior
 from pyro_dynogp.lti.views import steady_state_gain
-from pyro_dynogp.models.cascade import Cascade
-from pyro_dynogp.models.layers import Dynamic, Static
+from pyro_dynogp.models.delays import where_inputs_are_known
 from pyro_dynogp.models.linear import LinearDynamicGP
-from pyro_dynogp.record import Record
+from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.models.wiring import Dynamic, Static
 
 if TYPE_CHECKING:
-    from pyro_dynogp.discrepancy.evidence import Evidence
-    from pyro_dynogp.inference.result import Fit
+    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.statistics.evidence import Evidence
 
 Parameters = dict[str, tuple[float, float]]
 DRAWS = 200

@@ -8,27 +8,27 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from pyro_dynogp.discrepancy.extend import Model, has_function
-from pyro_dynogp.discrepancy.known_inputs import longest_delay, where_inputs_are_known
-from pyro_dynogp.inference.cascade_fit import climb, grow, starting_points
-from pyro_dynogp.inference.checkpoints import NOTHING_KEPT
-from pyro_dynogp.inference.descent import descend
-from pyro_dynogp.inference.dynamic_starts import Values
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.fit import at_optimum
-from pyro_dynogp.inference.lockstep import Functions
-from pyro_dynogp.inference.maximum import Optimum, maximise
-from pyro_dynogp.inference.potential import Potential
-from pyro_dynogp.inference.result import Fit
-from pyro_dynogp.inference.starts import (
+from pyro_dynogp.inference.fitted import Fit
+from pyro_dynogp.inference.methods.mode import climb, grow, starting_points
+from pyro_dynogp.inference.optimise.descent import descend
+from pyro_dynogp.inference.optimise.lockstep import Functions
+from pyro_dynogp.inference.optimise.maximum import Optimum, maximise
+from pyro_dynogp.inference.optimise.side_by_side import each_in_lockstep
+from pyro_dynogp.inference.starts.dynamic import Values
+from pyro_dynogp.inference.starts.poles import (
     grown,
     random_poles,
     starting_values,
     values_given_poles,
 )
-from pyro_dynogp.inference.versions import each_in_lockstep
-from pyro_dynogp.models.cascade import Cascade
+from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
 from pyro_dynogp.models.linear import LinearDynamicGP
-from pyro_dynogp.record import Record
+from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.models.variants import Model, has_function
+from pyro_dynogp.support.checkpoints import NOTHING_KEPT
 
 # Iterations and fresh starts beside the warm one, of linear models and of cascades.
 LINEAR_STEPS, LINEAR_STARTS = 120, 2

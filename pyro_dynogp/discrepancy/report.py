@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from pyro_dynogp.discrepancy.evidence import Curve, Evidence
+from pyro_dynogp.statistics.evidence import Curve, Evidence
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.result import Fit
+    from pyro_dynogp.data.record import Record
+    from pyro_dynogp.inference.fitted import Fit
     from pyro_dynogp.prediction.prediction import Prediction
-    from pyro_dynogp.record import Record
 
 Decision = Literal["accepted", "tie", "rejected", "not tried", "reported"]
 
@@ -146,7 +146,7 @@ class Report:
 
     def to_html(self, path: str | Path) -> None:
         """Write one self-contained page, figures inside."""
-        from pyro_dynogp.discrepancy.page import page
+        from pyro_dynogp.report.html.page import page
 
         Path(path).write_text(page(self), encoding="utf-8")
 

@@ -8,23 +8,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pyro_dynogp.criticism.comparison import block_standard_error
-from pyro_dynogp.discrepancy import words
-from pyro_dynogp.discrepancy.confirm import Confirmed
-from pyro_dynogp.discrepancy.course import Course
-from pyro_dynogp.discrepancy.effects import Effect
-from pyro_dynogp.discrepancy.evidence import Residuals
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.discrepancy.decision import Confirmed
 from pyro_dynogp.discrepancy.parameters import limits_of, parameters_of
 from pyro_dynogp.discrepancy.report import FoundEffect, Report
 from pyro_dynogp.discrepancy.rounds import Rounds
 from pyro_dynogp.discrepancy.search import Found
+from pyro_dynogp.discrepancy.state import Course
 from pyro_dynogp.discrepancy.trials import one_step_density
-from pyro_dynogp.parallel import parallel_map
-from pyro_dynogp.prediction.clock import joined
+from pyro_dynogp.effects import Effect
+from pyro_dynogp.prediction.records import joined
 from pyro_dynogp.prediction.scores import scores
-from pyro_dynogp.record import Record
+from pyro_dynogp.report import words
+from pyro_dynogp.statistics.evidence import Residuals
+from pyro_dynogp.support.parallel import parallel_map
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.result import Fit
+    from pyro_dynogp.inference.fitted import Fit
 
 # Scores that rise by less do not speak against what was added: effects of the noise change them
 # by chance.

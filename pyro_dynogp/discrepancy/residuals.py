@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp.channels import count_direct
 from pyro_dynogp.criticism.posterior_draws import draws_of, with_draws
-from pyro_dynogp.discrepancy.evidence import Residuals
-from pyro_dynogp.discrepancy.known_inputs import longest_delay, unknown_beginning
-from pyro_dynogp.models.cascade import Cascade
+from pyro_dynogp.data.channels import count_direct
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.models.delays import longest_delay, unknown_beginning
 from pyro_dynogp.models.limits import at_limits
-from pyro_dynogp.record import Record
+from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.statistics.evidence import Residuals
+from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.result import Fit
+    from pyro_dynogp.inference.fitted import Fit
 
 # Time constants until a simulation has settled, and the share of a record that may be lost to it.
 SETTLED, LOST = 4.0, 0.1

@@ -10,24 +10,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pyro_dynogp.criticism.comparison import block_standard_error
+from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.blocks import Blocks, shared
-from pyro_dynogp.discrepancy.confirm import Confirmed, certain, confirm
-from pyro_dynogp.discrepancy.effects import ClockShift, Effect
-from pyro_dynogp.discrepancy.evidence import Residuals
-from pyro_dynogp.discrepancy.extend import (
-    used_channels,
-    with_process_noise,
-    without_process_noise,
-)
-from pyro_dynogp.discrepancy.gate import Beyond, beyond_catalogue, structure_left
+from pyro_dynogp.discrepancy.decision import Confirmed, certain, confirm
 from pyro_dynogp.discrepancy.refits import quick_fit
 from pyro_dynogp.discrepancy.residuals import residuals_of
 from pyro_dynogp.discrepancy.search import Found, look, rated
 from pyro_dynogp.discrepancy.trials import forecast_density, forecast_errors, without
-from pyro_dynogp.record import Record
+from pyro_dynogp.effects import ClockShift, Effect
+from pyro_dynogp.models.variants import (
+    used_channels,
+    with_process_noise,
+    without_process_noise,
+)
+from pyro_dynogp.statistics.evidence import Residuals
+from pyro_dynogp.statistics.omnibus import Beyond, beyond_catalogue, structure_left
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.result import Fit
+    from pyro_dynogp.inference.fitted import Fit
 
 # Families of effects that go with inputs.
 OF_INPUTS = ("paths", "shapes")

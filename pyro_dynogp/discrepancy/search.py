@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pyro_dynogp.discrepancy.effects import Effect
-from pyro_dynogp.discrepancy.evidence import Evidence, Residuals
-from pyro_dynogp.discrepancy.extend import Model
-from pyro_dynogp.parallel import parallel_map
-from pyro_dynogp.record import Record
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.effects import Effect
+from pyro_dynogp.models.variants import Model
+from pyro_dynogp.statistics.evidence import Evidence, Residuals
+from pyro_dynogp.support.parallel import parallel_map
 
 # Least probable evidence of an effect that is tried because a relative's test rejects.
 RELATIVE = 0.3

@@ -11,15 +11,15 @@ import numpy as np
 from scipy.special import logsumexp
 
 from pyro_dynogp.criticism.densities import pointwise_log_density
-from pyro_dynogp.discrepancy.extend import Model
-from pyro_dynogp.discrepancy.known_inputs import comparable
+from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.refits import energy, poles_of, quick_fit, race
-from pyro_dynogp.inference.result import Fit
-from pyro_dynogp.models.cascade import Cascade
-from pyro_dynogp.models.collapsed import collapsed_of
-from pyro_dynogp.prediction.beginning import beginning
+from pyro_dynogp.inference.fitted import Fit
+from pyro_dynogp.models.delays import comparable
+from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.models.outputs import collapsed_of
+from pyro_dynogp.models.variants import Model
+from pyro_dynogp.prediction.first_state import beginning
 from pyro_dynogp.prediction.linear import prior_process
-from pyro_dynogp.record import Record
 
 # Blocks of a record on which effects of one instant are scored, every other one at a time.
 BLOCKS = 12

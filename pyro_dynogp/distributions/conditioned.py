@@ -9,8 +9,6 @@ from pyro.distributions import constraints
 from torch import Tensor
 from torch.distributions import Normal
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp._tensors import as_tensor
 from pyro_dynogp.distributions.process import ObservedLTIProcess
 from pyro_dynogp.distributions.trajectory import (
     Trajectory,
@@ -21,6 +19,8 @@ from pyro_dynogp.distributions.trajectory import (
 )
 from pyro_dynogp.lti.semiseparable import SemiseparableCovariance
 from pyro_dynogp.lti.state import ModalState
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.tensors import as_tensor
 
 
 class ConditionedLTIProcess(Trajectory):

@@ -21,10 +21,10 @@ import torch
 from torch import Tensor
 from torch.distributions import register_kl
 
-from pyro_dynogp._tensors import broadcast
 from pyro_dynogp.distributions.conditioned import ConditionedLTIProcess
 from pyro_dynogp.distributions.process import LTIProcess
 from pyro_dynogp.distributions.trajectory import apply
+from pyro_dynogp.support.tensors import broadcast
 
 
 @register_kl(ConditionedLTIProcess, LTIProcess)

@@ -22,14 +22,14 @@ from pyro.distributions import constraints
 from torch import Tensor
 from torch.distributions import MultivariateNormal, register_kl
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp._tensors import as_tensor, broadcast
 from pyro_dynogp.distributions.divergence import require_same
 from pyro_dynogp.distributions.process import LTIProcess
 from pyro_dynogp.distributions.trajectory import Trajectory, apply
 from pyro_dynogp.lti.grid import TimeGrid, time_grid
 from pyro_dynogp.lti.semiseparable import SemiseparableCovariance
 from pyro_dynogp.lti.state import ModalState, propagate
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.tensors import as_tensor, broadcast
 
 
 class InducingLTIProcess(Trajectory):

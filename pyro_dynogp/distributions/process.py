@@ -14,14 +14,14 @@ import torch
 from pyro.distributions import constraints
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp._tensors import as_tensor, broadcast
 from pyro_dynogp.distributions.trajectory import Trajectory, real_or_missing
 from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import Response, as_inputs, mean_response
 from pyro_dynogp.lti.semiseparable import SemiseparableCovariance, jitter_variance
 from pyro_dynogp.lti.state import ModalState
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.tensors import as_tensor, broadcast
 
 if TYPE_CHECKING:
     from pyro_dynogp.distributions.conditioned import ConditionedLTIProcess

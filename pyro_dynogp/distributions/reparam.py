@@ -9,8 +9,8 @@ import pyro.distributions as dist
 import torch
 from pyro.infer.reparam.reparam import Reparam
 
-from pyro_dynogp._errors import invalid
 from pyro_dynogp.distributions.trajectory import Trajectory
+from pyro_dynogp.support.errors import invalid
 
 
 class InnovationReparam(Reparam):

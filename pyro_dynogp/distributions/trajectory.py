@@ -10,10 +10,10 @@ import torch
 from pyro.distributions import TorchDistribution, constraints
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp._tensors import as_tensor
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.semiseparable import SemiseparableCovariance
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.tensors import as_tensor
 
 
 class _RealOrMissing(constraints.Constraint):

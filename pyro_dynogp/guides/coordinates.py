@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.distributions import biject_to
 from torch.distributions.transforms import Transform
 
-from pyro_dynogp._errors import invalid
+from pyro_dynogp.support.errors import invalid
 
 
 def parameter(

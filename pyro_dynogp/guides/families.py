@@ -16,8 +16,6 @@ from pyro.distributions import constraints
 from torch import Tensor
 from torch.distributions.transforms import ReshapeTransform
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp._tensors import as_tensor
 from pyro_dynogp.distributions.inducing import InducingLTIProcess, inducing_times
 from pyro_dynogp.distributions.process import LTIProcess
 from pyro_dynogp.guides.coordinates import (
@@ -29,6 +27,8 @@ from pyro_dynogp.guides.coordinates import (
     unconstrained,
 )
 from pyro_dynogp.guides.normal import FlatNormal
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.tensors import as_tensor
 
 
 class Family:

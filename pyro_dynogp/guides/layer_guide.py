@@ -16,12 +16,12 @@ from pyro.poutine.trace_messenger import TraceMessenger
 from pyro.poutine.util import prune_subsample_sites, site_is_subsample
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp._tensors import as_tensor, broadcast
 from pyro_dynogp.distributions.process import LTIProcess
 from pyro_dynogp.guides.coordinates import joint_normal, middle, to_support, unconstrained
 from pyro_dynogp.guides.families import Family, default_family
 from pyro_dynogp.guides.normal import PlacedDelta
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.tensors import as_tensor, broadcast
 
 # The auxiliary site of the joint normal, and the prefix of its parameters.
 JOINT = "_joint"

@@ -8,7 +8,7 @@ from pyro.distributions.distribution import Distribution
 from torch import Tensor
 from torch.distributions import Independent, Normal, register_kl
 
-from pyro_dynogp._tensors import broadcast
+from pyro_dynogp.support.tensors import broadcast
 
 
 class FlatNormal(dist.TransformedDistribution):

@@ -12,21 +12,21 @@ import pyro
 import torch
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp.inference.cascade_fit import GuideChoice, best_optima
-from pyro_dynogp.inference.checkpoints import Checkpoints
-from pyro_dynogp.inference.guides import Guide
-from pyro_dynogp.inference.layered import fit_layered
-from pyro_dynogp.inference.maximum import Optimizer, Optimum, maximise
-from pyro_dynogp.inference.posterior import Hyperparameters, posterior_of
-from pyro_dynogp.inference.potential import WALL
-from pyro_dynogp.inference.result import Fit, Method
-from pyro_dynogp.inference.sampling import sample_posterior
-from pyro_dynogp.inference.starts import grown, starting_values
-from pyro_dynogp.models.cascade import Cascade
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.inference.density import WALL
+from pyro_dynogp.inference.fitted import Fit, Method
+from pyro_dynogp.inference.methods.mode import GuideChoice, best_optima
+from pyro_dynogp.inference.methods.nuts import sample_posterior
+from pyro_dynogp.inference.methods.optima import Hyperparameters, posterior_of
+from pyro_dynogp.inference.methods.trajectories import fit_layered
+from pyro_dynogp.inference.optimise.maximum import Optimizer, Optimum, maximise
+from pyro_dynogp.inference.posteriors import Guide
+from pyro_dynogp.inference.starts.poles import grown, starting_values
 from pyro_dynogp.models.linear import LinearDynamicGP
-from pyro_dynogp.parallel import seeded
-from pyro_dynogp.record import Record
+from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.support.checkpoints import Checkpoints
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.parallel import seeded
 
 __all__ = ["Fit", "fit"]
 
@@ -61,7 +61,7 @@ def fit(
     is climbed from several starts, in parallel. "map" keeps the best optimum; "svi" fits a
     multivariate normal to the posterior around it (of a cascade, unless `hyperparameters` says
     otherwise, to that of inducing values and first states around up to four optima, with everything
-    else at the optimum: see `pyro_dynogp.inference.posterior`);
+    else at the optimum: see `pyro_dynogp.inference.methods.optima`);
     "nuts" samples it. The starts of a cascade are the best linear fits, spread over its layers;
     where static layers see process noise they climb without any first, and the better half goes on.
 

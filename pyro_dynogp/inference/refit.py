@@ -10,17 +10,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp.inference.checkpoints import NOTHING_KEPT
+from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.fit import draws_of_guide
-from pyro_dynogp.inference.guides import GaussianGuide, MixtureGuide
-from pyro_dynogp.inference.maximum import Optimum, maximise
-from pyro_dynogp.inference.posterior import Hyperparameters, posterior_of
-from pyro_dynogp.inference.result import Fit
-from pyro_dynogp.inference.sampling import sample_posterior
-from pyro_dynogp.models.cascade import Cascade
-from pyro_dynogp.parallel import seeded
-from pyro_dynogp.record import Record
+from pyro_dynogp.inference.fitted import Fit
+from pyro_dynogp.inference.methods.nuts import sample_posterior
+from pyro_dynogp.inference.methods.optima import Hyperparameters, posterior_of
+from pyro_dynogp.inference.optimise.maximum import Optimum, maximise
+from pyro_dynogp.inference.posteriors import GaussianGuide, MixtureGuide
+from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.support.checkpoints import NOTHING_KEPT
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.parallel import seeded
 
 # Iterations from the old optimum: of L-BFGS, of Adam, of SVI for all sites.
 LINEAR_STEPS, CASCADE_STEPS, SVI_STEPS = 300, 200, 400

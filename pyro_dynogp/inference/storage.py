@@ -17,19 +17,19 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp.channels import from_plain, to_plain
-from pyro_dynogp.inference.guides import GaussianGuide, MixtureGuide
-from pyro_dynogp.inference.potential import Potential
+from pyro_dynogp.data.channels import from_plain, to_plain
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.scaling import Scaling
+from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.posteriors import GaussianGuide, MixtureGuide
 from pyro_dynogp.layers.noise import Likelihood
-from pyro_dynogp.models.cascade import Cascade
-from pyro_dynogp.models.layers import Dynamic, Layer, Static
 from pyro_dynogp.models.linear import LinearDynamicGP
-from pyro_dynogp.record import Record
-from pyro_dynogp.scaling import Scaling
+from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.models.wiring import Dynamic, Layer, Static
+from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.result import Fit
+    from pyro_dynogp.inference.fitted import Fit
 
 FORMAT = "pyro_dynogp.fit"
 VERSION = 4
@@ -90,7 +90,7 @@ def load(path: str | Path) -> Fit:
         ValueError: where the file is missing, damaged, not a pyro_dynogp fit, or of a version
             that this package does not know.
     """
-    from pyro_dynogp.inference.result import Fit
+    from pyro_dynogp.inference.fitted import Fit
 
     path = Path(path)
     if not path.is_file():

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from pyro_dynogp.models.cascade import Cascade
-from pyro_dynogp.models.layers import Dynamic
-from pyro_dynogp.models.systems import DynamicSystem
+from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.models.system import DynamicSystem
+from pyro_dynogp.models.wiring import Dynamic
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.result import Fit
+    from pyro_dynogp.inference.fitted import Fit
 
 
 def summary(fit: Fit) -> str:

@@ -19,10 +19,10 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp._tensors import broadcast
 from pyro_dynogp.layers.kernels import SampledKernel
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.tensors import broadcast
 
 # Added to the diagonal of a matrix that is factored, as a share of the kernel's mean variance; the
 # second where the first does not suffice. Coincident locations need it: K_zz is then singular.

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.distributions import AffineTransform
 from torch.distributions import constraints as supports
 
-from pyro_dynogp._errors import invalid
+from pyro_dynogp.support.errors import invalid
 
 
 def hyperprior(kernel: kernels.Kernel, parameter: str) -> dist.Distribution:

@@ -21,10 +21,10 @@ from gpytorch import constraints, kernels
 from linear_operator import to_dense
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp._tensors import broadcast
 from pyro_dynogp.layers.hyperpriors import hyperprior, meaning, plain_name
 from pyro_dynogp.layers.radial import check_lengthscale, function_of_distance
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.tensors import broadcast
 
 MATERN = {0.5: "matern12", 1.5: "matern32", 2.5: "matern52"}
 # Kernels whose GPyTorch code takes parameters with more leading dimensions than they were made

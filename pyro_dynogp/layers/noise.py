@@ -13,9 +13,9 @@ import torch
 from scipy.special import gammainc, gammaincinv
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
 from pyro_dynogp.layers.functions import StaticFunction
 from pyro_dynogp.layers.static import sample_static
+from pyro_dynogp.support.errors import invalid
 
 # What varying noise is a function of.
 Driver = Literal["inputs", "output"]

@@ -19,8 +19,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp._tensors import broadcast
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.tensors import broadcast
 
 # What keeps the derivative of r finite at r = 0.
 TINY = 1e-30

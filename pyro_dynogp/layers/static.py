@@ -17,10 +17,10 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp._tensors import as_tensor
 from pyro_dynogp.layers.functions import JITTER, StaticFunction, even_grid
 from pyro_dynogp.layers.kernels import sample_kernel
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.tensors import as_tensor
 
 MeanName = Literal["constant", "linear"]
 

@@ -20,8 +20,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pyro_dynogp._tensors import as_tensor
 from pyro_dynogp.lti.modes import Modes
+from pyro_dynogp.support.tensors import as_tensor
 
 
 def modal_covariance(modes: Modes) -> tuple[Tensor, Tensor]:

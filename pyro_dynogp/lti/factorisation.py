@@ -24,7 +24,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from pyro_dynogp._compiled_cache import BORROWING, OPTIONS
 from pyro_dynogp.lti.arithmetic import (
     SEGMENT,
     add_outer,
@@ -36,6 +35,7 @@ from pyro_dynogp.lti.arithmetic import (
     rotate_rows,
     times,
 )
+from pyro_dynogp.support.compiled import BORROWING, OPTIONS
 
 
 @njit(**BORROWING)

@@ -10,12 +10,12 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from pyro_dynogp._compiled_cache import OPTIONS
-from pyro_dynogp._errors import invalid
 from pyro_dynogp.lti.arithmetic import rotate_rows
 from pyro_dynogp.lti.factorisation import factor_row
 from pyro_dynogp.lti.primitives import array, flatten_batch
 from pyro_dynogp.lti.semiseparable import SemiseparableCovariance
+from pyro_dynogp.support.compiled import OPTIONS
+from pyro_dynogp.support.errors import invalid
 
 
 @njit(**OPTIONS)

@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp._tensors import as_tensor, broadcast
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.tensors import as_tensor, broadcast
 
 NoiseStructure = Literal["shared", "independent"]
 

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 from torch.overrides import handle_torch_function, has_torch_function
 
-from pyro_dynogp._tensors import broadcast
 from pyro_dynogp.lti import factorisation, information, products
+from pyro_dynogp.support.tensors import broadcast
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from pyro_dynogp._compiled_cache import BORROWING, OPTIONS
 from pyro_dynogp.lti.arithmetic import rotate_rows
+from pyro_dynogp.support.compiled import BORROWING, OPTIONS
 
 
 @njit(**BORROWING)

@@ -17,13 +17,13 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from pyro_dynogp._compiled_cache import OPTIONS
-from pyro_dynogp._errors import invalid
-from pyro_dynogp._tensors import as_tensor
 from pyro_dynogp.lti.fused import propagators
 from pyro_dynogp.lti.grid import TimeGrid, time_grid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.primitives import array, flatten_batch, run
+from pyro_dynogp.support.compiled import OPTIONS
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.tensors import as_tensor
 
 
 @njit(**OPTIONS)

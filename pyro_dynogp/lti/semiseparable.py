@@ -16,8 +16,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp._tensors import as_tensor
 from pyro_dynogp.lti import primitives
 from pyro_dynogp.lti.covariance import (
     output_row,
@@ -28,6 +26,8 @@ from pyro_dynogp.lti.covariance import (
 from pyro_dynogp.lti.fused import output_rows, propagators
 from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.lti.modes import Modes
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.tensors import as_tensor
 
 
 class NotPositiveDefiniteError(ValueError):

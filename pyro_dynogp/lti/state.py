@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
 from pyro_dynogp.lti.covariance import complex_expm1, state_covariance, step_noise
 from pyro_dynogp.lti.modes import Modes
+from pyro_dynogp.support.errors import invalid
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,11 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pyro_dynogp._tensors import as_tensor
 from pyro_dynogp.lti.covariance import complex_expm1, state_covariance, step_noise
 from pyro_dynogp.lti.fused import propagators
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.state import real_propagator
+from pyro_dynogp.support.tensors import as_tensor
 
 
 @dataclass(frozen=True)

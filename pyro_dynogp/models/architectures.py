@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from pyro_dynogp.layers.noise import Gaussian, Likelihood
-from pyro_dynogp.models.cascade import Cascade
-from pyro_dynogp.models.layers import Dynamic, Static
+from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.models.wiring import Dynamic, Static
 
 
 def Wiener(

@@ -22,8 +22,8 @@ from pyro_dynogp.lti.grid import TimeGrid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import mean_response
 from pyro_dynogp.models.filter_functions import Block, functions_of
-from pyro_dynogp.models.layers import INPUTS, Dynamic, Wire
-from pyro_dynogp.models.systems import CascadeSystem, DynamicSystem, StaticSystem
+from pyro_dynogp.models.system import CascadeSystem, DynamicSystem, StaticSystem
+from pyro_dynogp.models.wiring import INPUTS, Dynamic, Wire
 from pyro_dynogp.moments.problem import FilterProblem, make_layout
 
 # What a channel is that is no static output.

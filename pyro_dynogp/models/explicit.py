@@ -7,12 +7,12 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from pyro_dynogp._tensors import as_tensor
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.distributions.process import LTIProcess
-from pyro_dynogp.models.layers import INPUTS, Wire
-from pyro_dynogp.models.systems import CascadeSystem, DynamicSystem, StaticSystem, see
-from pyro_dynogp.record import Record
-from pyro_dynogp.scaling import Scaling
+from pyro_dynogp.models.system import CascadeSystem, DynamicSystem, StaticSystem, see
+from pyro_dynogp.models.wiring import INPUTS, Wire
+from pyro_dynogp.support.tensors import as_tensor
 
 # Least variance of the conditional of a static layer's value (scaled units): its density is finite
 # where a sample lies on an inducing location.

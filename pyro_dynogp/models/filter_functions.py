@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp._tensors import broadcast
 from pyro_dynogp.layers.functions import StaticFunction, even_grid
 from pyro_dynogp.moments.functions import KERNELS
 from pyro_dynogp.moments.problem import TABLE
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.tensors import broadcast
 
 # Points of the table of a static function of one channel.
 GRID = 801

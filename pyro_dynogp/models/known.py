@@ -15,8 +15,8 @@ from torch import Tensor
 
 from pyro_dynogp.distributions.process import LTIProcess
 from pyro_dynogp.lti.grid import TimeGrid
-from pyro_dynogp.models.layers import INPUTS
-from pyro_dynogp.models.systems import CascadeSystem, DynamicSystem, StaticSystem, see
+from pyro_dynogp.models.system import CascadeSystem, DynamicSystem, StaticSystem, see
+from pyro_dynogp.models.wiring import INPUTS
 
 
 def is_known(layer: DynamicSystem) -> bool:

@@ -10,11 +10,11 @@ import pyro
 import torch
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp.models.layers import Layer, Limits, Static
-from pyro_dynogp.models.systems import CascadeSystem
-from pyro_dynogp.record import Record
-from pyro_dynogp.scaling import Scaling
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.scaling import Scaling
+from pyro_dynogp.models.system import CascadeSystem
+from pyro_dynogp.models.wiring import Layer, Limits, Static
+from pyro_dynogp.support.errors import invalid
 
 
 def scaled_limits(limits: Limits, scaling: Scaling | None) -> tuple[float, float]:

@@ -12,16 +12,16 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp._tensors import as_tensor
-from pyro_dynogp.channels import Channel, count_direct, prepared
+from pyro_dynogp.data.channels import Channel, count_direct, prepared
+from pyro_dynogp.data.record import Record, as_records
+from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.distributions.process import LTIProcess
 from pyro_dynogp.lti.covariance import real_covariance, state_covariance
 from pyro_dynogp.lti.modes import Modes, NoiseStructure
 from pyro_dynogp.lti.state import ModalState
 from pyro_dynogp.models.priors import FLAT, PriorName, TimeScale, sample_direct, sample_modes
-from pyro_dynogp.record import Record, as_records
-from pyro_dynogp.scaling import Scaling
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.tensors import as_tensor
 
 InitialState = Literal["integrated", "zero", "site"]
 
@@ -69,7 +69,7 @@ class LinearDynamicGP:
             process noise); or "site", sampled.
         direct: the last K inputs act on the output at once and without dynamics (trends, steps,
             calendars): their weights are the site ``direct``, normal(0, 1) in standard deviations.
-        channels: made from each record before the model sees it, see `pyro_dynogp.channels`.
+        channels: made from each record before the model sees it, see `pyro_dynogp.data.channels`.
         priors: "default", or "paper" for flat ones but for the horseshoe on the noise gains: fit
             with them, but do not sample from them, their draws exceed floating-point range.
         scaling: what one time step and one standard deviation are; learnt by `fit` from the

@@ -25,11 +25,11 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
+from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.distributions.decay import LogDecayRate
 from pyro_dynogp.distributions.shared_scale import SharedScaleNormal
 from pyro_dynogp.lti.modes import Modes, NoiseStructure
-from pyro_dynogp.scaling import Scaling
+from pyro_dynogp.support.errors import invalid
 
 PriorName = Literal["default", "paper"]
 

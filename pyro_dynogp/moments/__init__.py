@@ -2,6 +2,6 @@
 
 from pathlib import Path
 
-from pyro_dynogp._compiled_cache import drop_stale
+from pyro_dynogp.support.compiled import drop_stale
 
 drop_stale(Path(__file__).parent)

@@ -14,12 +14,12 @@ import math
 import numpy as np
 from numba import njit
 
-from pyro_dynogp._compiled_cache import BORROWING, INLINED, OPTIONS
 from pyro_dynogp.moments.layout import FLOOR, workspace
 from pyro_dynogp.moments.measured_function import function_terms
 from pyro_dynogp.moments.noise import noise_terms
 from pyro_dynogp.moments.state import covary, dot, move, update
 from pyro_dynogp.moments.static_layer import append
+from pyro_dynogp.support.compiled import BORROWING, INLINED, OPTIONS
 
 SEGMENT = 64
 

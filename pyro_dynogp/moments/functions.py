@@ -16,7 +16,7 @@ from functools import lru_cache
 import numpy as np
 from numba import njit
 
-from pyro_dynogp._compiled_cache import BORROWING
+from pyro_dynogp.support.compiled import BORROWING
 
 # Forms of a static function.
 TABLE = 0

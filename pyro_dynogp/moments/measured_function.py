@@ -25,8 +25,8 @@ import math
 import numpy as np
 from numba import njit
 
-from pyro_dynogp._compiled_cache import BORROWING, OPTIONS
 from pyro_dynogp.moments.functions import cubic, cubic_weights, place
+from pyro_dynogp.support.compiled import BORROWING, OPTIONS
 
 # The sum reproduces a Gaussian's density to 1e-7 up to five standard deviations. With this SPREAD
 # the nodes sqrt(3) SPREAD beside a component's are the second neighbours.

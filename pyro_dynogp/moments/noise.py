@@ -16,7 +16,7 @@ import math
 import numpy as np
 from numba import njit
 
-from pyro_dynogp._compiled_cache import BORROWING
+from pyro_dynogp.support.compiled import BORROWING
 
 _LOG_2PI = math.log(2.0 * math.pi)
 

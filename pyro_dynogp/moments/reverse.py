@@ -10,7 +10,6 @@ import math
 import numpy as np
 from numba import njit
 
-from pyro_dynogp._compiled_cache import BORROWING, OPTIONS
 from pyro_dynogp.moments.filtering import (
     SEGMENT,
     enter,
@@ -25,6 +24,7 @@ from pyro_dynogp.moments.measured_function import function_adjoint
 from pyro_dynogp.moments.noise import noise_adjoint
 from pyro_dynogp.moments.state import covary, dot, move_adjoint, update
 from pyro_dynogp.moments.static_layer import append, append_adjoint
+from pyro_dynogp.support.compiled import BORROWING, OPTIONS
 
 
 @njit(**BORROWING)

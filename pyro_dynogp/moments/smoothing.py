@@ -13,13 +13,13 @@ import math
 import numpy as np
 from numba import njit
 
-from pyro_dynogp._compiled_cache import BORROWING, OPTIONS
 from pyro_dynogp.moments.filtering import SEGMENT, enter, inner, measure, output_terms, seen
 from pyro_dynogp.moments.layout import FLOOR, workspace
 from pyro_dynogp.moments.measured_function import function_moments, function_terms
 from pyro_dynogp.moments.noise import noise_terms
 from pyro_dynogp.moments.state import covary, dot, step_back, update
 from pyro_dynogp.moments.static_layer import append
+from pyro_dynogp.support.compiled import BORROWING, OPTIONS
 
 
 @njit(**BORROWING)

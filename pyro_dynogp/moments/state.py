@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from numba import njit
 
-from pyro_dynogp._compiled_cache import BORROWING
+from pyro_dynogp.support.compiled import BORROWING
 
 
 @njit(**BORROWING)

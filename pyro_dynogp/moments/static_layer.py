@@ -16,9 +16,9 @@ import math
 
 from numba import njit
 
-from pyro_dynogp._compiled_cache import BORROWING
 from pyro_dynogp.moments.functions import TABLE, expansion, expansion_adjoint, locate
 from pyro_dynogp.moments.layout import FLOOR
+from pyro_dynogp.support.compiled import BORROWING
 
 
 @njit(**BORROWING)

@@ -6,10 +6,10 @@ no display needed. Save it with ``figure.savefig("name.png")``; a notebook shows
 
 from pyro_dynogp.plotting.calibration import calibration, predictive_checks
 from pyro_dynogp.plotting.diagnostics import history, residuals, starts
-from pyro_dynogp.plotting.discrepancy import before_after, evidence, residuals_before_after
 from pyro_dynogp.plotting.signals import prediction, record
 from pyro_dynogp.plotting.style import named
 from pyro_dynogp.plotting.systems import bode, impulse_response, pole_map
+from pyro_dynogp.report.figures import before_after, evidence, residuals_before_after
 
 __all__ = [
     "before_after",

@@ -11,10 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from pyro_dynogp._errors import invalid
 from pyro_dynogp.criticism.calibration import Calibration
 from pyro_dynogp.criticism.predictive_checks import PredictiveChecks
 from pyro_dynogp.plotting import style
+from pyro_dynogp.support.errors import invalid
 
 OUTSIDE: dict[str, Any] = {
     "linestyle": "none",

@@ -9,12 +9,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from pyro_dynogp._errors import invalid
 from pyro_dynogp.plotting import style
+from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.result import Fit
-    from pyro_dynogp.record import Record
+    from pyro_dynogp.data.record import Record
+    from pyro_dynogp.inference.fitted import Fit
 
 
 def residuals(fit: Fit, record: Record) -> Figure:

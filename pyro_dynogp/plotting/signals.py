@@ -8,12 +8,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pyro_dynogp._errors import invalid
 from pyro_dynogp.plotting import style
+from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
+    from pyro_dynogp.data.record import Record
     from pyro_dynogp.prediction.prediction import Prediction
-    from pyro_dynogp.record import Record
 
 
 def record(record: Record) -> Figure:

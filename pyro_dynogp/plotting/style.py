@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 if TYPE_CHECKING:
-    from pyro_dynogp.record import Record
+    from pyro_dynogp.data.record import Record
 
 # Colours of Okabe and Ito, which colour-blind readers can tell apart.
 MEASURED = "#222222"

@@ -9,12 +9,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
-from pyro_dynogp._errors import invalid
 from pyro_dynogp.lti import views
 from pyro_dynogp.plotting import style
+from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.result import Fit
+    from pyro_dynogp.inference.fitted import Fit
 
 DAMPING_LINES = (0.05, 0.1, 0.2, 0.4, 0.7)
 

@@ -8,19 +8,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp._tensors import as_tensor
+from pyro_dynogp.data.record import Record
 from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.models.assembly import Assembly, assemble
-from pyro_dynogp.models.systems import DynamicSystem, scaled_inputs, scaled_outputs
+from pyro_dynogp.models.system import DynamicSystem, scaled_inputs, scaled_outputs
 from pyro_dynogp.moments import filtering, smoothing
 from pyro_dynogp.moments.problem import FilterProblem, each
-from pyro_dynogp.prediction.beginning import beginning, cascade_of
-from pyro_dynogp.prediction.clock import one_record
-from pyro_dynogp.record import Record
+from pyro_dynogp.prediction.first_state import beginning, cascade_of
+from pyro_dynogp.prediction.records import one_record
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.tensors import as_tensor
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.result import Fit
+    from pyro_dynogp.inference.fitted import Fit
 
 
 @dataclass(frozen=True)

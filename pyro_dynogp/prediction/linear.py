@@ -9,21 +9,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pyro_dynogp._errors import invalid
-from pyro_dynogp._tensors import as_tensor
+from pyro_dynogp.data.record import Record
 from pyro_dynogp.distributions.process import LTIProcess, ObservedLTIProcess
 from pyro_dynogp.distributions.trajectory import split_missing
 from pyro_dynogp.lti.filtering import predict_k_steps
 from pyro_dynogp.lti.semiseparable import SemiseparableCovariance
 from pyro_dynogp.lti.state import ModalState, propagate
 from pyro_dynogp.models.linear import LinearDynamicGP, initial_mean
-from pyro_dynogp.parallel import seeded
-from pyro_dynogp.prediction.clock import following, gap_between, one_record
 from pyro_dynogp.prediction.prediction import Prediction
-from pyro_dynogp.record import Record
+from pyro_dynogp.prediction.records import following, gap_between, one_record
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.parallel import seeded
+from pyro_dynogp.support.tensors import as_tensor
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.result import Fit
+    from pyro_dynogp.inference.fitted import Fit
 
 # In the kind of a k-step prediction whose joint samples depend on each other as its errors do.
 JOINT = ", errors drawn jointly"

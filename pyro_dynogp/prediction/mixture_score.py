@@ -15,7 +15,7 @@ import math
 import numpy as np
 from numba import njit
 
-from pyro_dynogp._compiled_cache import OPTIONS
+from pyro_dynogp.support.compiled import OPTIONS
 
 _ROOT_TWO = math.sqrt(2.0)
 _DENSITY_AT_ZERO = 1.0 / math.sqrt(2.0 * math.pi)

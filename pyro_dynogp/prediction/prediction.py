@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from scipy.special import log_ndtr, logsumexp, ndtr, ndtri, ndtri_exp
 
-from pyro_dynogp._errors import invalid
+from pyro_dynogp.support.errors import invalid
 
 # A quantile is found to this share of the smallest standard deviation of a component; steps for it.
 RESOLUTION, ITERATIONS = 1e-10, 100

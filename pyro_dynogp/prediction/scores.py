@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from pyro_dynogp._errors import invalid
+from pyro_dynogp.data.record import Record
 from pyro_dynogp.prediction.mixture_score import mixture_crps
 from pyro_dynogp.prediction.prediction import Prediction
-from pyro_dynogp.record import Record
+from pyro_dynogp.support.errors import invalid
 
 
 def scores(prediction: Prediction, record: Record, skip: int = 0) -> dict[str, Any]:

@@ -20,14 +20,14 @@ from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.left_out import monte_carlo_error
 from pyro_dynogp.criticism.posterior_draws import draws_of, with_draws
 from pyro_dynogp.criticism.subjects import FitSubject, observed_of
-from pyro_dynogp.inference.checkpoints import NOTHING_KEPT
-from pyro_dynogp.inference.maximum import Optimum
-from pyro_dynogp.inference.posterior import posterior_of
+from pyro_dynogp.inference.methods.optima import posterior_of
+from pyro_dynogp.inference.optimise.maximum import Optimum
 from pyro_dynogp.inference.refit import optima_of, refit
 from pyro_dynogp.models.assembly import assemble
-from pyro_dynogp.models.cascade import Cascade
+from pyro_dynogp.models.model import Cascade
 from pyro_dynogp.moments import filtering, smoothing
 from pyro_dynogp.moments.problem import each
+from pyro_dynogp.support.checkpoints import NOTHING_KEPT
 from tests.conftest import simulate_record
 
 QUIET: dict[str, Any] = {"workers": 1, "progress": False}

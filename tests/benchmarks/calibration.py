@@ -22,10 +22,10 @@ from pyro.infer import MCMC, NUTS
 from scipy import stats
 
 import pyro_dynogp as dgp
-from pyro_dynogp.inference.maximum import maximise
-from pyro_dynogp.inference.potential import Potential
-from pyro_dynogp.inference.starts import starting_values
-from pyro_dynogp.parallel import child_seeds, parallel_map, seeded
+from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.optimise.maximum import maximise
+from pyro_dynogp.inference.starts.poles import starting_values
+from pyro_dynogp.support.parallel import child_seeds, parallel_map, seeded
 
 KEPT = 19  # ranks 0..19: ten bins of two
 

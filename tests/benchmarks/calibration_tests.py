@@ -10,7 +10,7 @@ import numpy as np
 from scipy import stats
 
 import pyro_dynogp as dgp
-from pyro_dynogp.parallel import parallel_map
+from pyro_dynogp.support.parallel import parallel_map
 from tests.criticism.known import measured, predicted
 
 SAMPLES, JOINT, REPLICATES = 500, 199, 200

@@ -15,9 +15,9 @@ from pyro.infer import SVI, TraceMeanField_ELBO
 from pyro.optim import ClippedAdam
 
 import pyro_dynogp as dgp
-from pyro_dynogp.inference.layered import layer_guide, with_trajectories
-from pyro_dynogp.inference.potential import Potential
-from pyro_dynogp.models.cascade import Cascade
+from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.methods.trajectories import layer_guide, with_trajectories
+from pyro_dynogp.models.model import Cascade
 
 # Seconds of one epoch of the authors' code on two cores of such a machine: mini-batch times by
 # number of mini-batches (10 samples; coupled drives 40), as measured beforehand.
@@ -55,7 +55,7 @@ def record(n: int, inputs: int) -> dgp.Record:
 
 def values_of(model: Cascade, data: dgp.Record) -> dict[str, torch.Tensor]:
     """Moderate values of all parameters."""
-    from pyro_dynogp.inference.cascade_starts import Plan, starting_point
+    from pyro_dynogp.inference.starts.plans import Plan, starting_point
 
     assert model.scaling is not None
     return starting_point(model, (data,), model.scaling, Plan(None, None, False, 0))

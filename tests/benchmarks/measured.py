@@ -17,8 +17,8 @@ import numpy as np
 import pandas as pd
 
 import pyro_dynogp as dgp
-from pyro_dynogp import datasets
-from pyro_dynogp.channels import Calendar
+from pyro_dynogp.data.channels import Calendar
+from pyro_dynogp.examples import datasets
 
 # Half-hours that are averaged, days of Melbourne's pleasant temperature [degC].
 HALF_HOURS, COMFORT = 6, 18.0

@@ -20,7 +20,7 @@ from typing import Any, cast
 import numpy as np
 
 import pyro_dynogp as dgp
-from pyro_dynogp.parallel import parallel_map
+from pyro_dynogp.support.parallel import parallel_map
 from tests.benchmarks.circumstances import here
 from tests.benchmarks.kept_rows import append_row, read_rows
 from tests.benchmarks.planted_table import NOTHING, confusion_picture, is_right, tables

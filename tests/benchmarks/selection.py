@@ -14,7 +14,7 @@ import torch
 
 import pyro_dynogp as dgp
 from pyro_dynogp.lti.response import mean_response
-from pyro_dynogp.parallel import parallel_map, seeded
+from pyro_dynogp.support.parallel import parallel_map, seeded
 
 SAMPLES, STEP = 300, 0.1
 TARGET: Any = "missing sample"

@@ -8,10 +8,10 @@ import pytest
 from scipy import stats
 
 import pyro_dynogp as dgp
-from pyro_dynogp.criticism._crps import climatological, hersbach, quantile_members
-from pyro_dynogp.criticism._envelope import envelope
-from pyro_dynogp.criticism._pit import pit_curves
 from pyro_dynogp.criticism.calibration import calibration
+from pyro_dynogp.criticism.crps import climatological, hersbach, quantile_members
+from pyro_dynogp.criticism.envelope import envelope
+from pyro_dynogp.criticism.probability_integral import pit_curves
 
 from .known import measured, predicted, series
 

@@ -10,7 +10,7 @@ import torch
 import pyro_dynogp as dgp
 from pyro_dynogp.criticism.arviz_bridge import good_k
 from pyro_dynogp.criticism.finding import Finding, apart
-from pyro_dynogp.inference.guides import GaussianGuide
+from pyro_dynogp.inference.posteriors import GaussianGuide
 from tests.conftest import simulate_record
 
 QUIET = {"workers": 1, "progress": False}

@@ -8,8 +8,8 @@ from scipy.stats import multivariate_normal, norm
 
 import pyro_dynogp as dgp
 from pyro_dynogp.criticism.densities import pointwise_log_density
-from pyro_dynogp.models.collapsed import ObservedCascade, collapsed_of
-from pyro_dynogp.models.layers import Dynamic, Static
+from pyro_dynogp.models.outputs import ObservedCascade, collapsed_of
+from pyro_dynogp.models.wiring import Dynamic, Static
 from tests.lti import oracles
 from tests.lti.oracles import random_system, tensor
 from tests.moments.joint import linear_cascade

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pyro_dynogp.criticism._ranks import holm, rank_of, uniformity
 from pyro_dynogp.criticism.rank_results import judged
+from pyro_dynogp.criticism.ranks import holm, rank_of, uniformity
 
 L = 99
 

@@ -10,7 +10,7 @@ import pyro_dynogp as dgp
 from pyro_dynogp.criticism import simulation_based
 from pyro_dynogp.criticism.posterior_draws import PosteriorDraws
 from pyro_dynogp.criticism.simulation_based import _FixedCascade, _simulated, _Task
-from pyro_dynogp.inference.result import Fit
+from pyro_dynogp.inference.fitted import Fit
 
 QUIET = {"workers": 1, "progress": False}
 

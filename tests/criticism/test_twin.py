@@ -11,10 +11,10 @@ import pyro_dynogp as dgp
 from pyro_dynogp.criticism import arviz_bridge, twin
 from pyro_dynogp.criticism.posterior_draws import log_joint_of
 from pyro_dynogp.criticism.twin import Effort, Gap, _judged, _rms, _sites, twin_findings
-from pyro_dynogp.inference.guides import GaussianGuide, gaussian_guide
-from pyro_dynogp.inference.potential import Potential
+from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.methods.nuts import Chains
+from pyro_dynogp.inference.posteriors import GaussianGuide, gaussian_guide
 from pyro_dynogp.inference.refit import refit
-from pyro_dynogp.inference.sampling import Chains
 from tests.conftest import simulate_record
 
 QUIET = {"workers": 1, "progress": False}

@@ -4,8 +4,8 @@ import numpy as np
 from scipy import stats
 from scipy.signal import lfilter
 
-from pyro_dynogp.discrepancy.evidence import Residuals
-from pyro_dynogp.discrepancy.filters import fitted_filter
+from pyro_dynogp.statistics.autoregression import fitted_filter
+from pyro_dynogp.statistics.evidence import Residuals
 
 
 def coloured(rng, shape, pole):

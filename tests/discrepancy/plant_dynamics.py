@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.signal import lfilter
 
-from pyro_dynogp.simulators import simulate_states
+from pyro_dynogp.examples.simulators import simulate_states
 
 Array = NDArray[np.float64]
 Function = Callable[[Array], Array]

@@ -4,10 +4,10 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from pyro_dynogp.discrepancy.evidence import Curve, Evidence
+from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.report import Attempt, FoundEffect, Report
 from pyro_dynogp.prediction.prediction import Prediction
-from pyro_dynogp.record import Record
+from pyro_dynogp.statistics.evidence import Curve, Evidence
 
 GIVEN = ("Inputs: valve [V]", "Dynamics: 3 pairs of poles, process noise", "Noise: Gaussian")
 EXTENDED = (

@@ -7,7 +7,7 @@ import pandas as pd
 from scipy.signal import lfilter
 from scipy.stats import binom
 
-from pyro_dynogp.discrepancy.evidence import Residuals
+from pyro_dynogp.statistics.evidence import Residuals
 
 STEP = 0.5
 

@@ -11,7 +11,7 @@ import pytest
 
 import pyro_dynogp as dgp
 from pyro_dynogp.discrepancy.blocks import blocks_of
-from pyro_dynogp.prediction.clock import joined
+from pyro_dynogp.prediction.records import joined
 
 
 def record(n: int, begin: int = 0) -> dgp.Record:

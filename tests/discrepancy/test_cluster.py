@@ -7,7 +7,7 @@ import joblib
 import pytest
 
 import pyro_dynogp as dgp
-from pyro_dynogp.parallel import parallel_map
+from pyro_dynogp.support.parallel import parallel_map
 from tests.discrepancy.test_loop import FEW, fitted, machine
 
 

@@ -13,13 +13,13 @@ import pytest
 from scipy.signal import lfilter
 
 import pyro_dynogp as dgp
-from pyro_dynogp.channels import Transformed
-from pyro_dynogp.discrepancy import effects
-from pyro_dynogp.discrepancy.evidence import Evidence, Residuals
-from pyro_dynogp.discrepancy.extend import Model, with_channel
-from pyro_dynogp.discrepancy.looking import evidence, lasting
-from pyro_dynogp.discrepancy.own_past import with_past
-from pyro_dynogp.record import Record
+from pyro_dynogp import effects
+from pyro_dynogp.data.channels import Transformed
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.models.variants import Model, with_channel
+from pyro_dynogp.statistics.detecting import evidence, lasting
+from pyro_dynogp.statistics.evidence import Evidence, Residuals
+from pyro_dynogp.statistics.regression import with_past
 
 FEW = (effects.ExtraInput(), effects.LevelShift(), effects.HeavyTails())
 N = 480

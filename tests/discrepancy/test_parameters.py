@@ -7,13 +7,21 @@ import pytest
 from scipy.signal import cont2discrete, lfilter
 
 import pyro_dynogp as dgp
-from pyro_dynogp.channels import DeadZone, Delayed, Play, Recorded, ShiftedClock, Sinusoid, Step
-from pyro_dynogp.discrepancy.evidence import Evidence
-from pyro_dynogp.discrepancy.extend import with_channel
+from pyro_dynogp.data.channels import (
+    DeadZone,
+    Delayed,
+    Play,
+    Recorded,
+    ShiftedClock,
+    Sinusoid,
+    Step,
+)
+from pyro_dynogp.data.signals import dead_zone, delayed, play
 from pyro_dynogp.discrepancy.parameters import limits_of, parameters_of
-from pyro_dynogp.inference.maximum import maximise
-from pyro_dynogp.inference.potential import Potential
-from pyro_dynogp.signals import dead_zone, delayed, play
+from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.optimise.maximum import maximise
+from pyro_dynogp.models.variants import with_channel
+from pyro_dynogp.statistics.evidence import Evidence
 
 N, STEP = 160, 0.5
 TIME = STEP * np.arange(N)

@@ -28,7 +28,7 @@ def coloured(n=900, seed=0):
 
 def test_the_catalogue_has_the_names_of_the_search():
     assert set(EFFECTS) - set(CATALOGUE) == {OUTSIDE}
-    from pyro_dynogp.discrepancy.effects import CATALOGUE as SEARCHED
+    from pyro_dynogp.effects import CATALOGUE as SEARCHED
 
     assert set(CATALOGUE) == {effect.name for effect in SEARCHED}
 

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 
 import pyro_dynogp as dgp
-from pyro_dynogp.channels import Delayed, Recorded, Trend
-from pyro_dynogp.discrepancy import effects, refits
-from pyro_dynogp.discrepancy.extend import as_cascade, with_channel, without_process_noise
+from pyro_dynogp import effects
+from pyro_dynogp.data.channels import Delayed, Recorded, Trend
+from pyro_dynogp.discrepancy import refits
 from pyro_dynogp.discrepancy.refits import energy, quick_fit, race
 from pyro_dynogp.discrepancy.search import candidates_of
+from pyro_dynogp.models.variants import as_cascade, with_channel, without_process_noise
 from tests.discrepancy.made import coloured
 from tests.discrepancy.plant_dynamics import System, response
-from tests.discrepancy.test_confirm import spoken_for, two_inputs
+from tests.discrepancy.test_decision import spoken_for, two_inputs
 
 N, STEP, LATE = 300, 0.1, 5
 MODEL = dgp.LinearDynamicGP(1, pairs=1)

@@ -10,14 +10,14 @@ import pytest
 from scipy.signal import lfilter
 
 import pyro_dynogp as dgp
-from pyro_dynogp.discrepancy import effects
+from pyro_dynogp import effects
 from pyro_dynogp.discrepancy.blocks import blocks_of
-from pyro_dynogp.discrepancy.course import Course
-from pyro_dynogp.discrepancy.evidence import Evidence
 from pyro_dynogp.discrepancy.refits import quick_fit
 from pyro_dynogp.discrepancy.rounds import Looked, Rounds
 from pyro_dynogp.discrepancy.search import Found
+from pyro_dynogp.discrepancy.state import Course
 from pyro_dynogp.discrepancy.trials import without
+from pyro_dynogp.statistics.evidence import Evidence
 
 from .series import residuals, share
 

@@ -8,17 +8,17 @@ import pytest
 import torch
 
 import pyro_dynogp as dgp
-from pyro_dynogp.channels import Recorded
 from pyro_dynogp.criticism.comparison import block_standard_error
-from pyro_dynogp.discrepancy.confirm import ERRORS, NATS
-from pyro_dynogp.discrepancy.extend import with_channel, with_pairs, without_process_noise
+from pyro_dynogp.data.channels import Recorded
+from pyro_dynogp.discrepancy.decision import ERRORS, NATS
 from pyro_dynogp.discrepancy.refits import quick_fit
 from pyro_dynogp.discrepancy.trials import held_out_density
-from pyro_dynogp.inference import cascade_fit
-from pyro_dynogp.inference.cascade_fit import grow, starting_points
-from pyro_dynogp.inference.checkpoints import NOTHING_KEPT
-from pyro_dynogp.inference.maximum import maximise
-from pyro_dynogp.inference.starts import grown
+from pyro_dynogp.inference.methods import mode as cascade_fit
+from pyro_dynogp.inference.methods.mode import grow, starting_points
+from pyro_dynogp.inference.optimise.maximum import maximise
+from pyro_dynogp.inference.starts.poles import grown
+from pyro_dynogp.models.variants import with_channel, with_pairs, without_process_noise
+from pyro_dynogp.support.checkpoints import NOTHING_KEPT
 from tests.discrepancy.made import coloured
 from tests.discrepancy.plant_dynamics import System, response
 

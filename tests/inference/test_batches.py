@@ -6,10 +6,10 @@ import pytest
 import torch
 
 import pyro_dynogp as dgp
-from pyro_dynogp.channels import Trend
-from pyro_dynogp.inference.maximum import maximise
-from pyro_dynogp.inference.potential import Potential
-from pyro_dynogp.inference.starts import starting_values
+from pyro_dynogp.data.channels import Trend
+from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.optimise.maximum import maximise
+from pyro_dynogp.inference.starts.poles import starting_values
 from tests.conftest import simulate_record
 
 ONE = simulate_record(dgp.Modes([-0.6 + 2.0j], [[0.8 + 0.3j]], [1.0], [[0.15]]), 1e-2, n=40)

@@ -12,10 +12,10 @@ from pyro.infer.autoguide import AutoNormal
 
 import pyro_dynogp as dgp
 from pyro_dynogp.guides.families import Point
-from pyro_dynogp.inference.cascade_starts import Plan, linear_twin, starting_point
-from pyro_dynogp.inference.guides import GaussianGuide, MixtureGuide
-from pyro_dynogp.inference.layered import layer_guide
-from pyro_dynogp.inference.starts import starting_values
+from pyro_dynogp.inference.methods.trajectories import layer_guide
+from pyro_dynogp.inference.posteriors import GaussianGuide, MixtureGuide
+from pyro_dynogp.inference.starts.plans import Plan, linear_twin, starting_point
+from pyro_dynogp.inference.starts.poles import starting_values
 from tests.inference.cascades import FAST, same, wiener, wiener_record
 
 SMALL = {"pairs": 1, "inducing": 5}

@@ -3,11 +3,11 @@
 import torch
 
 import pyro_dynogp as dgp
-from pyro_dynogp.inference import cascade_fit
-from pyro_dynogp.inference.cascade_fit import without_process_noise
-from pyro_dynogp.inference.cascade_starts import plans
-from pyro_dynogp.inference.maximum import maximise
-from pyro_dynogp.models.layers import Dynamic, Static
+from pyro_dynogp.inference.methods import mode as cascade_fit
+from pyro_dynogp.inference.methods.mode import without_process_noise
+from pyro_dynogp.inference.optimise.maximum import maximise
+from pyro_dynogp.inference.starts.plans import plans
+from pyro_dynogp.models.wiring import Dynamic, Static
 from tests.inference.cascades import wiener
 
 OPTIMA = [{"optimum": torch.tensor(float(k))} for k in range(4)]

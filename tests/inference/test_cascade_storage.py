@@ -13,9 +13,9 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 import pyro_dynogp as dgp
-from pyro_dynogp.inference.guides import MixtureGuide, gaussian_guide
-from pyro_dynogp.inference.potential import Potential
-from pyro_dynogp.inference.result import Fit
+from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.fitted import Fit
+from pyro_dynogp.inference.posteriors import MixtureGuide, gaussian_guide
 from pyro_dynogp.inference.storage import FORMAT
 from tests.inference.cascades import FAST, wiener_record
 

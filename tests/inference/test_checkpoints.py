@@ -14,8 +14,9 @@ import pytest
 import torch
 
 import pyro_dynogp as dgp
-from pyro_dynogp.inference import checkpoints, svi
-from pyro_dynogp.inference.checkpoints import Checkpoints, tensor_text, text_tensor
+from pyro_dynogp.inference.methods import svi
+from pyro_dynogp.support import checkpoints
+from pyro_dynogp.support.checkpoints import Checkpoints, tensor_text, text_tensor
 from tests.inference.cascades import FAST, same, wiener
 from tests.inference.conftest import COLLAPSED, LAYERED
 
@@ -102,7 +103,7 @@ class TestPiece:
 
 SCRIPT = """
 import pyro_dynogp as dgp
-from pyro_dynogp.inference import svi
+from pyro_dynogp.inference.methods import svi
 from tests.inference import conftest
 from tests.inference.cascades import wiener, wiener_record
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import rosen, rosen_der, rosen_hess
 
-from pyro_dynogp.inference.descent import FLAT, LEAST, bounded_root, descend, hessian
+from pyro_dynogp.inference.optimise.descent import FLAT, LEAST, bounded_root, descend, hessian
 
 
 def functions_of(value, gradient):

@@ -27,7 +27,7 @@ class TestMap:
         )
 
     def test_is_a_stationary_point(self, map_fit, record):
-        from pyro_dynogp.inference.potential import Potential
+        from pyro_dynogp.inference.density import Potential
 
         function = Potential(map_fit.model, (record[:160],), dict(map_fit.mode))
         energy, slope = function.value_and_gradient(function.pack(map_fit.mode).numpy())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize, rosen, rosen_der
 
-from pyro_dynogp.inference.lockstep import in_lockstep
+from pyro_dynogp.inference.optimise.lockstep import in_lockstep
 
 
 def run(start):

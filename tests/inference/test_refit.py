@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import pyro_dynogp as dgp
-from pyro_dynogp.inference.guides import MixtureGuide
+from pyro_dynogp.inference.posteriors import MixtureGuide
 from pyro_dynogp.inference.refit import optima_of, refit
 from tests.inference.cascades import FAST, wiener
 

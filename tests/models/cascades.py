@@ -8,7 +8,7 @@ import torch
 from pyro import poutine
 
 import pyro_dynogp as dgp
-from pyro_dynogp.models.layers import Dynamic, Static
+from pyro_dynogp.models.wiring import Dynamic, Static
 
 SMALL = {"pairs": 2, "inducing": 6}
 

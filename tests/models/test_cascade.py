@@ -12,8 +12,8 @@ from pyro.infer import Predictive
 from scipy.stats import norm
 
 import pyro_dynogp as dgp
-from pyro_dynogp.models.layers import Dynamic, Static
 from pyro_dynogp.models.limits import at_limits
+from pyro_dynogp.models.wiring import Dynamic, Static
 from tests.models.cascades import (
     MODELS,
     SMALL,

@@ -13,7 +13,7 @@ import pyro_dynogp as dgp
 from pyro_dynogp.distributions.process import LTIProcess
 from pyro_dynogp.layers.functions import StaticFunction
 from pyro_dynogp.models.filter_functions import GRID, table_range
-from pyro_dynogp.models.layers import Dynamic, Static
+from pyro_dynogp.models.wiring import Dynamic, Static
 from tests.models.cascades import (
     MODELS,
     blank,

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import pyro_dynogp as dgp
-from pyro_dynogp import channels
+from pyro_dynogp.data import channels
 
 STEP = channels.Step(15.0)
 

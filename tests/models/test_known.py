@@ -8,10 +8,10 @@ import pytest
 import torch
 
 import pyro_dynogp as dgp
-from pyro_dynogp.inference.potential import Potential, denormals_flushed
+from pyro_dynogp.inference.density import Potential, denormals_flushed
 from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.models import known
-from pyro_dynogp.models.layers import Dynamic, Static
+from pyro_dynogp.models.wiring import Dynamic, Static
 from tests.lti import oracles
 from tests.lti.oracles import tensor
 from tests.models.cascades import make_record

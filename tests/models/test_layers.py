@@ -2,7 +2,7 @@
 
 import pytest
 
-from pyro_dynogp.models.layers import Dynamic, Static, wire
+from pyro_dynogp.models.wiring import Dynamic, Static, wire
 from tests.models.cascades import MODELS
 
 

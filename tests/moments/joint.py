@@ -8,8 +8,8 @@ import torch
 from pyro_dynogp.layers.functions import StaticFunction
 from pyro_dynogp.layers.kernels import SampledKernel, _default_form
 from pyro_dynogp.layers.noise import Gaussian, Noise
-from pyro_dynogp.models.layers import Dynamic, wire
-from pyro_dynogp.models.systems import CascadeSystem, DynamicSystem, StaticSystem
+from pyro_dynogp.models.system import CascadeSystem, DynamicSystem, StaticSystem
+from pyro_dynogp.models.wiring import Dynamic, wire
 from tests.lti import oracles
 from tests.lti.oracles import tensor
 

@@ -9,8 +9,8 @@ import torch
 from pyro_dynogp.distributions.process import LTIProcess
 from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.models.assembly import assemble
-from pyro_dynogp.models.collapsed import ObservedCascade
-from pyro_dynogp.models.layers import Dynamic, Static
+from pyro_dynogp.models.outputs import ObservedCascade
+from pyro_dynogp.models.wiring import Dynamic, Static
 from pyro_dynogp.moments import filtering, smoothing
 from tests.lti import oracles
 from tests.lti.oracles import NOISES, assert_close, tensor

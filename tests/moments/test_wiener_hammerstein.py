@@ -10,9 +10,9 @@ from scipy.stats import norm
 from pyro_dynogp.layers.functions import StaticFunction
 from pyro_dynogp.layers.kernels import SampledKernel, _default_form
 from pyro_dynogp.layers.noise import Gaussian, Noise
-from pyro_dynogp.models.collapsed import ObservedCascade
-from pyro_dynogp.models.layers import Dynamic, Static, wire
-from pyro_dynogp.models.systems import CascadeSystem, DynamicSystem, StaticSystem
+from pyro_dynogp.models.outputs import ObservedCascade
+from pyro_dynogp.models.system import CascadeSystem, DynamicSystem, StaticSystem
+from pyro_dynogp.models.wiring import Dynamic, Static, wire
 from tests.lti import oracles as lti
 from tests.lti.oracles import tensor
 from tests.moments.wiener import Wiener, particle_filter

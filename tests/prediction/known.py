@@ -10,9 +10,9 @@ import pyro
 import torch
 
 import pyro_dynogp as dgp
-from pyro_dynogp.inference.result import Fit
+from pyro_dynogp.inference.fitted import Fit
 from pyro_dynogp.lti.state import ModalState
-from pyro_dynogp.models.systems import scaled_inputs
+from pyro_dynogp.models.system import scaled_inputs
 
 
 def steps_record(n=120, step=0.1, seed=0, hold=8):

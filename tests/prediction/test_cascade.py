@@ -10,8 +10,8 @@ from scipy import stats
 from scipy.stats import kurtosis
 
 import pyro_dynogp as dgp
-from pyro_dynogp.models.systems import scaled_inputs
-from pyro_dynogp.prediction.beginning import estimate
+from pyro_dynogp.models.system import scaled_inputs
+from pyro_dynogp.prediction.first_state import estimate
 from pyro_dynogp.prediction.linear import prior_process
 from tests.prediction.known import (
     fit_of,

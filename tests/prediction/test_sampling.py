@@ -9,10 +9,9 @@ import torch
 
 import pyro_dynogp as dgp
 from pyro_dynogp.lti.grid import time_grid
+from pyro_dynogp.models import draws as sampling
 from pyro_dynogp.models.assembly import assemble
-from pyro_dynogp.models.layers import Dynamic, Static
-from pyro_dynogp.prediction import sampling
-from pyro_dynogp.prediction.sampling import (
+from pyro_dynogp.models.draws import (
     JointState,
     Randomness,
     Switches,
@@ -20,6 +19,7 @@ from pyro_dynogp.prediction.sampling import (
     fresh_noise,
     known_start,
 )
+from pyro_dynogp.models.wiring import Dynamic, Static
 from tests.lti import oracles
 from tests.lti.oracles import NOISES, assert_close, random_system, tensor
 from tests.models.cascades import case, draw, parameters

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import expm, solve_continuous_lyapunov, toeplitz
 
 import pyro_dynogp as dgp
-from pyro_dynogp.simulators import discretise
+from pyro_dynogp.examples.simulators import discretise
 from tests.benchmarks import wiener
 
 # Of the inputs [rad/s].

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 import pyro_dynogp as dgp
-from pyro_dynogp.inference.potential import Potential
+from pyro_dynogp.inference.density import Potential
 from tests.benchmarks.paper.prediction import OURS, Outcome, Predicted, Task
 
 SAMPLES = 400

@@ -1,0 +1,1 @@
+"""Measured records: reading, checking, scaling, channels made from them."""

@@ -1,0 +1,197 @@
+"""Scaling: the step, offsets and scales in which models state their priors."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pyro_dynogp.data.checks import Array
+from pyro_dynogp.data.record import Record, as_records
+from pyro_dynogp.support.errors import invalid
+
+_ARRAYS = ("input_offset", "input_scale", "output_offset", "output_scale")
+_NAMES = ("input_names", "output_names", "input_units", "output_units")
+
+
+@dataclass(frozen=True, eq=False)
+class Scaling:
+    """Clock and signal scales of the training data, learnt from them alone.
+
+    Scaled signals are (u - input_offset) / input_scale and (y - output_offset) / output_scale.
+
+    Attributes:
+        time_step: median step over all records [time_unit].
+        duration: time from first to last sample of the longest record [time_unit].
+        input_offset: mean of each input over all samples, (n_u,) float64 [input_units].
+        input_scale: standard deviation of each input, (n_u,) float64 [input_units].
+        output_offset: mean of each output where it is not missing, (n_y,) float64 [output_units].
+        output_scale: standard deviation of each output, (n_y,) float64 [output_units].
+        input_names: names of the inputs.
+        output_names: names of the outputs.
+        input_units: units of the inputs.
+        output_units: units of the outputs.
+        time_unit: unit of time.
+    """
+
+    time_step: float
+    duration: float
+    input_offset: Array
+    input_scale: Array
+    output_offset: Array
+    output_scale: Array
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    input_units: tuple[str, ...]
+    output_units: tuple[str, ...]
+    time_unit: str
+
+    def __post_init__(self) -> None:
+        for field in _ARRAYS:
+            array = np.array(getattr(self, field), dtype=np.float64)
+            array.setflags(write=False)
+            object.__setattr__(self, field, array)
+
+    @classmethod
+    def from_records(cls, records: Record | Sequence[Record]) -> Scaling:
+        """Learn the scaling from the training record, or from several, pooled.
+
+        Args:
+            records: the training data; never give test data here.
+
+        Returns:
+            The scaling. Standard deviations are those of the samples (divided by their number).
+
+        Raises:
+            ValueError: no outputs, an output without a sample, a constant input or output, or no
+                record with two samples.
+        """
+        several = as_records(records)
+        first = several[0]
+        steps = np.concatenate([np.diff(record.time) for record in several])
+        if not len(steps):
+            raise invalid("records", expected="a record of two samples or more", got="one sample")
+        if not first.n_outputs:
+            raise invalid(
+                "records", expected="an output to learn from", got="records without outputs"
+            )
+        u_offset, u_scale = _statistics("input", [r.inputs for r in several], first.input_names)
+        y_offset, y_scale = _statistics("output", [r.outputs for r in several], first.output_names)
+        # The mean step of a regular record carries less rounding than the median of differences.
+        regular = len(several) == 1 and first.is_regular
+        return cls(
+            time_step=first.sampling_time if regular else float(np.median(steps)),
+            duration=max(record.duration for record in several),
+            input_offset=u_offset,
+            input_scale=u_scale,
+            output_offset=y_offset,
+            output_scale=y_scale,
+            time_unit=first.time_unit,
+            **{field: getattr(first, field) for field in _NAMES},
+        )
+
+    def check(self, record: Record, *, outputs: bool = True) -> None:
+        """Refuse a record whose channels or units are not those of the training data.
+
+        Args:
+            record: the record that a fitted model is to be used with.
+            outputs: False where the inputs alone are used (a simulation).
+
+        Raises:
+            ValueError: other names, another number of channels, other units.
+        """
+        roles = ("input", "output") if outputs else ("input",)
+        for role in roles:
+            expected, got = getattr(self, f"{role}_names"), getattr(record, f"{role}_names")
+            if expected != got:
+                raise invalid(
+                    f"record.{role}_names",
+                    expected=f"{list(expected)}, as in the training record",
+                    got=f"{list(got)}",
+                    advice="Record.select chooses and orders the channels.",
+                )
+            expected, got = getattr(self, f"{role}_units"), getattr(record, f"{role}_units")
+            for name, trained, given in zip(
+                getattr(self, f"{role}_names"), expected, got, strict=True
+            ):
+                self._check_unit(f"unit of {role} {name!r}", trained, given)
+        self._check_unit("record.time_unit", self.time_unit, record.time_unit)
+
+    @staticmethod
+    def _check_unit(argument: str, trained: str, given: str) -> None:
+        if trained != given:
+            raise invalid(
+                argument,
+                expected=f"{trained!r}, as in the training record",
+                got=f"{given!r}",
+                advice="Convert the values of the record and state their unit: units mismatch.",
+            )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain dict for JSON; floats as hexadecimal text, so that they come back to the bit."""
+        plain: dict[str, Any] = {}
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if field.name in _ARRAYS:
+                plain[field.name] = [float(x).hex() for x in value]
+            elif isinstance(value, float):
+                plain[field.name] = value.hex()
+            else:
+                plain[field.name] = list(value) if field.name in _NAMES else value
+        return plain
+
+    @classmethod
+    def from_dict(cls, plain: Mapping[str, Any]) -> Scaling:
+        """Scaling from what `to_dict` gave.
+
+        Raises:
+            ValueError: missing or unknown entries, or text that is no hexadecimal number.
+        """
+        fields = {field.name for field in dataclasses.fields(cls)}
+        if set(plain) != fields:
+            raise invalid("plain", expected=f"entries {sorted(fields)}", got=f"{sorted(plain)}")
+        values = dict(plain)
+        try:
+            for field in _ARRAYS:
+                values[field] = np.array([float.fromhex(x) for x in plain[field]])
+            for field in ("time_step", "duration"):
+                values[field] = float.fromhex(plain[field])
+        except (TypeError, ValueError) as error:
+            raise invalid("plain", expected="float.hex texts", got=str(error)) from error
+        values |= {field: tuple(plain[field]) for field in _NAMES}
+        return cls(**values)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Scaling):
+            return NotImplemented
+        return self.to_dict() == other.to_dict()
+
+    def __hash__(self) -> int:
+        return hash((self.time_step, self.duration, self.input_names, self.output_names))
+
+
+def _statistics(role: str, arrays: list[Array], names: tuple[str, ...]) -> tuple[Array, Array]:
+    """Mean and standard deviation of each column, gaps skipped; constants are refused."""
+    pooled = np.concatenate(arrays)
+    offset, scale = np.zeros(len(names)), np.ones(len(names))
+    for i, name in enumerate(names):
+        seen = pooled[~np.isnan(pooled[:, i]), i]
+        if not len(seen):
+            raise invalid(
+                f"{role} {name!r}", expected="samples to learn from", got="missing samples alone"
+            )
+        offset[i], scale[i] = seen.mean(), seen.std()
+        if scale[i] <= 1e-12 * np.abs(seen).max():
+            raise invalid(
+                f"{role} {name!r}",
+                expected="a signal that varies",
+                got=f"the constant {seen[0]:g}",
+                advice="There is nothing to identify: train on data in which it moves."
+                if role == "output"
+                else "Leave the input out (Record.select): a constant acts through the output "
+                "offset alone.",
+            )
+    return offset, scale

@@ -1,0 +1,202 @@
+"""The course of a loop: what its rounds have come to so far, and what the next one makes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.discrepancy.data_faults import data_spikes
+from pyro_dynogp.discrepancy.decision import Confirmed
+from pyro_dynogp.discrepancy.refits import quick_fit
+from pyro_dynogp.discrepancy.report import Attempt
+from pyro_dynogp.discrepancy.rounds import Looked, Rounds, Stopwatch, goes_with_inputs
+from pyro_dynogp.discrepancy.search import Candidate, Found, candidates_of
+from pyro_dynogp.discrepancy.trials import without
+from pyro_dynogp.effects import ProcessNoise
+from pyro_dynogp.models.variants import Model, has_process_noise
+from pyro_dynogp.report.words import OUTSIDE
+from pyro_dynogp.statistics.evidence import Residuals
+
+if TYPE_CHECKING:
+    from pyro_dynogp.inference.fitted import Fit
+
+FED_BACK = "inputs are under feedback, for which the residual speaks more clearly"
+OTHERS = "others are more probable, or no block of the model stands for it"
+
+
+@dataclass(eq=False)
+class Course:
+    """What rounds have come to.
+
+    Where process noise hides what is missing, rounds begin without it. It comes back as soon as it
+    costs nothing; and where nothing can be added without it, rounds begin again with it: what it
+    takes up may be all that keeps a fit from explaining it by dynamics that run away.
+
+    Attributes:
+        rounds: what they have in common. watch: where the time goes.
+        first: fit of the model as given. plain: of that model without process noise.
+        current: fit of the model so far. model: that model.
+        hidden: in words, that process noise hides what is missing; empty where it does not.
+        waiting: process noise that is taken away until it costs nothing.
+        returned: whether rounds began again with it.
+        number: of rounds so far.
+        accepted: effects in order. seen: residuals before each of them was added.
+        attempts: what was tried. reported: what no block mends, by the last tests.
+        left: what is left, in words, by the last tests. notes: what else there is to say.
+    """
+
+    rounds: Rounds
+    watch: Stopwatch
+    first: Fit
+    plain: Fit = field(init=False)
+    current: Fit = field(init=False)
+    model: Model = field(init=False)
+    hidden: str = field(init=False)
+    waiting: set[str] = field(default_factory=set)
+    returned: bool = False
+    number: int = 0
+    accepted: list[tuple[Found, Confirmed]] = field(default_factory=list)
+    seen: list[Sequence[Residuals]] = field(default_factory=list)
+    attempts: list[Attempt] = field(default_factory=list)
+    reported: list[Found] = field(default_factory=list)
+    left: tuple[str, ...] = ()
+    notes: list[str] = field(default_factory=list)
+    _looked: Looked | None = None
+
+    def __post_init__(self) -> None:
+        self.plain = self.rounds.plain(self.first)
+        self.hidden = self.rounds.hiding(self.first, self.plain)
+        self._go_on_from(self.first)
+        if self.hidden and has_process_noise(self.first.model):
+            self._go_on_from(self.plain)
+            self.waiting = {ProcessNoise.name}
+
+    def go_round(self) -> bool:
+        """Look, try what the residual speaks for, and add what helps; whether to go on."""
+        self.number += 1
+        looked = self.look()
+        if self.number == 1:
+            self.notes += [*_spikes(looked.residuals, self.rounds.data.known), *looked.notes]
+        rounds, known = self.rounds, self.rounds.data.known
+        chosen: list[Candidate] = []
+        if self.left:
+            open_loop = [f for f in looked.found if not self._is_fed_back(f)]
+            chosen = candidates_of(open_loop, self.model, known, rounds.level, rounds.tries)
+        self.attempts += self._untried(looked.found, chosen)
+        if chosen:
+            confirmed = rounds.confirm(chosen, self.current, self.number)
+            self.watch.stop("refits")
+            self.attempts += confirmed.attempts
+            if confirmed.winner is not None and confirmed.model is not None:
+                self._add(confirmed.winner, confirmed, confirmed.model, looked)
+                return True
+        if not (self.left and self.waiting) or self.accepted:
+            return False
+        self._go_on_from(self.first)
+        self.waiting, self.returned = set(), True
+        return True
+
+    def look(self) -> Looked:
+        """Test the residuals of the model so far."""
+        known = self.waiting | {one.effect.name for one, _ in self.accepted}
+        # A function of the output that is there has its limits, too.
+        known |= {one.name for one in self.rounds.effects if one.special_of in known}
+        plain = None if self.accepted else self.plain
+        looked = self.rounds.look(self.current, known, plain)
+        # Of the last tests: what a model lacks may look like what no block mends (feedback).
+        self.reported = [
+            f for f in looked.found if not f.effect.added and f.q_value <= self.rounds.gate
+        ]
+        self.left = self.rounds.left(looked)
+        self._looked = looked
+        self.watch.stop("residual tests")
+        return looked
+
+    def doubt(self) -> None:
+        """Add a cause outside the catalogue as a tie, where what is left explains far more."""
+        if not (self.accepted and self.left and self._looked):
+            return
+        beyond = self.rounds.beyond(self._looked.whole)
+        self.accepted = [
+            (winner, replace(one, ties=(*one.ties, OUTSIDE)))
+            if OUTSIDE not in one.ties and self.rounds.doubtful(winner, before, beyond)
+            else (winner, one)
+            for (winner, one), before in zip(self.accepted, self.seen, strict=True)
+        ]
+        self.watch.stop("residual tests")
+
+    def said_of_hiding(self) -> list[str]:
+        """That process noise hides what is missing, and what was done about it."""
+        if not self.hidden:
+            return []
+        back = has_process_noise(self.current.model)
+        if not has_process_noise(self.first.model):  # it is in some layers only
+            done = "Fit it with process_noise=False, and close the loop on that."
+        elif not self.returned:
+            done = "The search began without it, and the extended model " + (
+                "has it again: there it costs nothing." if back else "does without it."
+            )
+            if not self.accepted:
+                done = "Without it nothing is missing: fit it with process_noise=False."
+        elif self.accepted:
+            done = "The search without it found nothing to add, and began again with it."
+        else:
+            done = "Neither without it nor with it did the search find anything to add."
+        return [f"The model as given {self.hidden}: such noise can hide what is missing. {done}"]
+
+    def _is_fed_back(self, found: Found) -> bool:
+        """Whether inputs under feedback make an effect: it goes with them, and is less certain.
+
+        Inputs that follow the output's disturbances are among what explains the residual, whatever
+        the model is. (What a model lacks may look like feedback, but less than like itself.)
+        """
+        certain = [f.evidence.p_value for f in self.reported]
+        return (
+            bool(certain)
+            and goes_with_inputs(found.effect)
+            and found.evidence.p_value > min(certain)
+        )
+
+    def _untried(self, found: Sequence[Found], chosen: Sequence[Candidate]) -> list[Attempt]:
+        """Effects that the residual speaks for, but that were not refitted."""
+        tried = [one for one, _ in chosen]
+        attempts = []
+        for f in found:
+            if f.q_value > self.rounds.level or any(f is one for one in tried):
+                continue
+            attempt = Attempt(self.number, f.evidence, f.q_value, "not tried", OTHERS)
+            if not f.effect.added:
+                attempt = replace(attempt, decision="reported", reason="is reported, not added")
+            elif self._is_fed_back(f):
+                attempt = replace(attempt, reason=FED_BACK)
+            attempts.append(attempt)
+        return attempts
+
+    def _add(self, winner: Found, confirmed: Confirmed, larger: Model, looked: Looked) -> None:
+        """Go on with the model that a winner extends."""
+        rounds = self.rounds
+        if rounds.doubtful(winner, looked.whole, rounds.beyond(looked.residuals)):
+            confirmed = replace(confirmed, ties=(*confirmed.ties, OUTSIDE))
+        self.accepted.append((winner, confirmed))
+        self.seen.append(looked.whole)
+        self.watch.stop("residual tests")
+        again = rounds.hold_out_less(winner)
+        fit = confirmed.fit
+        if fit is None or again:
+            training = without(rounds.data.known, rounds.held_out)
+            fit = quick_fit(larger, training, rounds.seed, self.current)
+        if self.waiting and (noisy := rounds.with_process_noise(fit)) is not None:
+            fit, self.waiting = noisy, set()
+        self._go_on_from(fit)
+        self.watch.stop("refits")
+
+    def _go_on_from(self, fit: Fit) -> None:
+        self.current, self.model = fit, replace(fit.model, scaling=None)
+
+
+def _spikes(residuals: Sequence[Residuals], record: Record) -> list[str]:
+    """Spikes of the outputs, in words, also in samples that tests leave out."""
+    whole = [replace(one, output=record.outputs[:, a]) for a, one in enumerate(residuals)]
+    return [fault.sentence for one in whole if (fault := data_spikes(one)) is not None]

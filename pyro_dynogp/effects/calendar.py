@@ -1,0 +1,206 @@
+"""Effects of the calendar: hour of day, weekday, weekend, season, in a given time zone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+
+from pyro_dynogp.data.channels.clock import DAYS_A_YEAR, turn_of_the_year
+from pyro_dynogp.effects.clock_effects import clock_shift
+from pyro_dynogp.effects.clocks import all_zones, in_zone, stamps_of
+from pyro_dynogp.statistics.bootstrap import columns_score, replicates, sieve, spanning
+from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
+from pyro_dynogp.statistics.shares_of_inputs import own
+from pyro_dynogp.support.errors import invalid
+
+__all__ = ["calendar", "clock_shift"]
+
+# Days that must be looked at before a contrast is tried: fewer do not repeat it.
+DAYS_FOR_HOURS, DAYS_FOR_WEEK, DAYS_FOR_YEAR = 3, 14, 548
+WEEKDAYS = ("Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun")
+TURN = ("20 Dec", "24 Dec", "28 Dec", "1 Jan", "5 Jan", "9 Jan", "13 Jan")
+SEASONS = ("Dec-Feb", "Mar-May", "Jun-Aug", "Sep-Nov")
+# Nats by which another clock than that of the stamps must be better to be named.
+OWN = 3.0
+# Contrasts of the year; the others are of the day and the week.
+YEARLY = ("season", "time of year", "turn of the year")
+
+
+@dataclass(frozen=True, eq=False)
+class Contrast:
+    """One way to read the calendar.
+
+    Attributes:
+        what, zone: its name, and where the clock hangs.
+        columns: of the zone's that span it. degrees: K.
+        groups: (n,) number of each sample's group, for the picture. labels: of the groups.
+    """
+
+    what: str
+    zone: str
+    columns: tuple[int, ...]
+    degrees: int
+    groups: np.ndarray
+    labels: tuple[str, ...]
+
+
+def calendar(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 0) -> list[Evidence]:
+    """A level that depends on the calendar, beside what the inputs explain; all samples.
+
+    Weeks and years are long: what was fitted to is looked at, too. A fit can take part of a
+    calendar up, not make one.
+
+    Group averages are free for hour of day (24), weekday (7), weekend (2), hour by weekend (48),
+    season (4); time of year is two harmonics of a year, the turn of the year seven hats four days
+    apart around the first of January. One statistic for all of the day and the week and for all
+    zones, and one for all of the year: what repeats every day must not hide what does once a year.
+
+    Args:
+        residuals: of one output (n,), with stamps.
+        zones: IANA names of time zones whose clocks are tried beside that of the stamps.
+        seed: of the replicates.
+
+    Returns:
+        One piece of evidence of the day and the week; another one of the year where the record is
+        long enough. where: what ("hour of day", "weekday", "weekend", "hour of day by
+        weekday/weekend"; "season", "time of year", "turn of the year"), zone (that of the stamps
+        where clocks cannot be told apart).
+
+    Raises:
+        ValueError: where there are no stamps, a zone is unknown, the record is shorter than three
+            days, or fewer than 30 held-out samples are measured.
+
+    Source: F test of group contrasts in the whitened residual; its null by `sieve`.
+    """
+    contrasts, columns = _contrasts(residuals, zones, np.isfinite(residuals.residual))
+    of_year = [c for c in contrasts if c.what in YEARLY]
+    others = [c for c in contrasts if c.what not in YEARLY]
+    # One clock is enough to take the calendar's lines out of the noise's filter.
+    lines = sorted({k for c in contrasts if c.zone == contrasts[0].zone for k in c.columns})
+    return [_best_of(residuals, some, columns, lines, seed) for some in (others, of_year) if some]
+
+
+def _best_of(
+    r: Residuals, contrasts: Sequence[Contrast], columns: np.ndarray, lines: list[int], seed: int
+) -> Evidence:
+    """Evidence of the contrast that explains most.
+
+    Args:
+        contrasts: that are tried. columns: (n, M) of all clocks.
+        lines: those that are taken out of the noise's filter.
+    """
+    x = r.residual
+    variants = [np.array(c.columns) for c in contrasts]
+    few = len(lines) < np.isfinite(x).sum() // 5
+    found = sieve(
+        x,
+        columns_score(columns, variants, spanning(own(r)), ~np.isfinite(x)),
+        np.array([c.degrees for c in contrasts]),
+        deviations=r.deviations,
+        first=columns[:, lines] if few else None,
+        replicates=replicates(len(r), columns.shape[1]),
+        seed=seed,
+    )
+    # The record's own clock, where others tell no better.
+    own_zone = str(stamps_of(r).tz)
+    likely = [
+        k for k, one in enumerate(contrasts)
+        if (one.what, one.zone) == (contrasts[found.best].what, own_zone)
+        and found.gain - found.gains[k] < OWN
+    ]  # fmt: skip
+    best = contrasts[likely[0] if likely else found.best]
+    curve = _averages(r, best, x, found.fitted)
+    high, low = int(np.argmax(curve.fitted)), int(np.argmin(curve.fitted))
+    labels = [best.labels[int(i)] for i in curve.x]
+    return Evidence(
+        effect="calendar",
+        statistic=found.statistic,
+        p_value=found.p_value,
+        gain=found.gain,
+        size=found.size,
+        where={"what": best.what, "zone": best.zone},
+        sentence=f"{r.output_name!r} depends on the {best.what} ({best.zone}) beyond what the "
+        f"model knows: about {found.size:.2g} {r.output_unit} (rms), most at {labels[high]}, "
+        f"least at {labels[low]}.",
+        curve=curve,
+    )
+
+
+def _contrasts(
+    r: Residuals, zones: Sequence[str], looked: np.ndarray
+) -> tuple[list[Contrast], np.ndarray]:
+    """All contrasts that what is looked at repeats, each once; and the columns of all (n, M)."""
+    stamps = stamps_of(r)
+    found, blocks, seen = list[Contrast](), list[np.ndarray](), set[tuple[str, bytes]]()
+    for zone in all_zones(stamps, zones):
+        local = in_zone(stamps, zone)
+        days = len(np.unique(local[looked].date)) if looked.any() else 0
+        contrasts, columns = _in_zone(local, zone, days)
+        first, kept = sum(b.shape[1] for b in blocks), list[Contrast]()
+        for c in contrasts:
+            # Clocks a constant number of hours apart make the same groups: the first is kept.
+            key = (c.what, pd.factorize(c.groups)[0].tobytes())
+            if len(np.unique(c.groups[looked])) > 1 and key not in seen:
+                seen.add(key)
+                kept.append(replace(c, columns=tuple(first + k for k in c.columns)))
+        if kept:
+            found += kept
+            blocks.append(columns)
+    if not found:
+        raise invalid("residuals", expected="at least three days held out", got="fewer")
+    return found, np.concatenate(blocks, axis=1)
+
+
+def _in_zone(local: pd.DatetimeIndex, zone: str, days: int) -> tuple[list[Contrast], np.ndarray]:
+    """Contrasts of one clock, and their columns (n, M): hours, hours at weekends, weekdays, ..."""
+    hour, weekday = np.asarray(local.hour), np.asarray(local.day_of_week)
+    weekend = (weekday >= 5).astype(int)
+    hours, hours_named = np.eye(24)[hour], tuple(f"{h} h" for h in range(24))
+    K = max(len(np.unique(hour)) - 1, 1)
+    contrasts, blocks = list[Contrast](), list[np.ndarray]()
+
+    def add(what: str, degrees: int, new: np.ndarray, groups, labels, also=()) -> None:
+        first = sum(b.shape[1] for b in blocks)
+        blocks.append(new)
+        columns = (*also, *range(first, first + new.shape[1]))
+        contrasts.append(Contrast(what, zone, columns, degrees, groups, tuple(labels)))
+
+    if days >= DAYS_FOR_HOURS:
+        add("hour of day", K, hours, hour, hours_named)
+    if days >= DAYS_FOR_WEEK:
+        named = hours_named + tuple(f"{h} at weekends" for h in hours_named)
+        cells, at_weekends = hour + 24 * weekend, hours * weekend[:, None]
+        what = "hour of day by weekday/weekend"
+        add(what, 2 * K + 1, at_weekends, cells, named, also=range(24))
+        add("weekend", 1, weekend[:, None].astype(float), weekend, ("working days", "weekends"))
+        add("weekday", 6, np.eye(7)[weekday], weekday, WEEKDAYS)
+    if days >= DAYS_FOR_YEAR:
+        season, month = np.asarray(local.month % 12) // 3, np.asarray(local.month) - 1
+        add("season", 3, np.eye(4)[season], season, SEASONS)
+        angle = 2.0 * np.pi * np.asarray(local.day_of_year + local.hour / 24.0) / 365.2425
+        year = np.column_stack([f(k * angle) for k in (1, 2) for f in (np.cos, np.sin)])
+        months = [pd.Timestamp(2000, m, 1).strftime("%B") for m in range(1, 13)]
+        add("time of year", 4, year, month, months)
+        gone = (np.asarray(local.day_of_year) - 1.0 + np.asarray(local.hour) / 24.0) / DAYS_A_YEAR
+        hats = turn_of_the_year(gone)
+        near = np.where(hats.any(1), hats.argmax(1), len(TURN))
+        add("turn of the year", len(TURN), hats, near, (*TURN, "the rest of the year"))
+    return contrasts, np.concatenate(blocks, axis=1) if blocks else np.zeros((len(hour), 0))
+
+
+def _averages(r: Residuals, best: Contrast, x: np.ndarray, fitted: np.ndarray) -> Curve:
+    """Averages of residual and effect in each group, the residual's own average removed."""
+    known = np.isfinite(x)
+    groups, at = np.unique(best.groups[known], return_inverse=True)
+    count = np.bincount(at)
+    y = x[known] - x[known].mean()
+    return Curve(
+        x=groups.astype(float),
+        y=np.bincount(at, y) / count,
+        fitted=np.bincount(at, fitted[known]) / count,
+        x_label=f"{best.what}, {best.zone}",
+        y_label=f"residual of {r.output_name} [{r.output_unit}]",
+    )

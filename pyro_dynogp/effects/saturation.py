@@ -1,0 +1,125 @@
+"""An output that stops at a limit."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from pyro_dynogp.effects.ties import Ties, ties_at_the_top
+from pyro_dynogp.statistics.detecting import (
+    NOTICED,
+    about,
+    binned,
+    evidence,
+    labelled,
+    lasting,
+    located_limits,
+    of_positive_weight,
+    unit,
+)
+from pyro_dynogp.statistics.evidence import Evidence, Residuals
+from pyro_dynogp.statistics.regression import with_past
+
+# Exact ties as improbable as this are a limit, and name it.
+TIED = 0.01
+# Largest slope beyond a limit, as a share of that before it: what goes on rising is no limit.
+FLAT = 0.3
+# Quantiles of the mean above which it may flatten; below, their complements.
+UPPER = np.array([0.5, 0.6, 0.7, 0.8, 0.9, 0.95])
+
+
+def saturation(residuals: Residuals, *, seed: int = 0) -> Evidence:
+    """Test whether the output stops at an upper or a lower limit.
+
+    Two signs, of which either does: exact ties at the largest or smallest measured value (see
+    `ties_at_the_top`), and an output that flattens where the mean goes on: to less than 0.3 of its
+    slope, or it is another nonlinearity. `where`: low, high [output], infinite where there is none.
+
+    Raises:
+        ValueError: where fewer than 30 samples are held out and measured.
+    """
+    r = residuals
+    top = ties_at_the_top(r.output, r.mean, seed=seed)
+    bottom = ties_at_the_top(-r.output, -r.mean, seed=seed)
+    bottom = dataclasses.replace(bottom, limit=-bottom.limit)
+    tied = min(1.0, 2.0 * min(top.p_value, bottom.p_value))
+    knots = _knots(r.mean)
+    found = of_positive_weight(
+        lasting(r, [_clipped(r.mean, *k) for k in knots], with_past(r.mean), seed)
+    )
+    # Two tests where values tie at all; two equal ones out of many may be chance.
+    p = min(1.0, 2.0 * min(tied, found.p_value)) if tied < 1.0 else found.p_value
+    if tied <= found.p_value or tied < TIED:
+        low = bottom.limit if bottom.p_value < TIED or bottom.p_value < top.p_value else -np.inf
+        high = top.limit if top.p_value < TIED or top.p_value <= bottom.p_value else np.inf
+        gain = -float(np.log(max(tied, 1e-300)))
+        found = dataclasses.replace(
+            found,
+            statistic=(2.0 * gain - 1.0) / np.sqrt(2.0),
+            gain=gain,
+            size=_cut(top, bottom, low, high),
+        )
+        counts = [str(t.count) for t, at in ((bottom, low), (top, high)) if np.isfinite(at)]
+        how = f" ({' and '.join(counts)} samples at exactly that value)"
+    else:
+        low, high, slope = _flat_limits(r, knots[found.best], p < NOTICED)
+        p = 1.0 if p < NOTICED and slope > FLAT else p
+        how = ""
+    limits = [f"{at:.4g}{unit(r.output_unit)}" for at in (low, high) if np.isfinite(at)]
+    flattened = np.clip(r.mean, low, high)
+    return evidence(
+        "saturation",
+        dataclasses.replace(found, p_value=p),
+        {"low": low, "high": high},
+        f"'{r.output_name}' stops at {' and '.join(limits)}{how}{about(r, found)}.",
+        binned(
+            r,
+            r.mean,
+            r.output,
+            flattened,
+            (
+                labelled(f"simulated {r.output_name}", r.output_unit),
+                labelled(r.output_name, r.output_unit),
+            ),
+        ),
+    )
+
+
+def _knots(mean: np.ndarray) -> list[tuple[float, float]]:
+    """Limits in units of the mean that are tried: above, below, both."""
+    high, low = np.quantile(mean, UPPER), np.quantile(mean, 1.0 - UPPER)
+    above = [(-np.inf, float(c)) for c in high]
+    below = [(float(c), np.inf) for c in low]
+    both = [(float(a), float(b)) for a in low[1::2] for b in high[1::2]]
+    return [*above, *below, *both]
+
+
+def _clipped(mean: np.ndarray, low: float, high: float) -> np.ndarray:
+    return with_past(np.clip(mean, low, high) - mean)
+
+
+def _flat_limits(
+    r: Residuals, knot: tuple[float, float], finer: bool
+) -> tuple[float, float, float]:
+    """Output at the knots, and the slope beyond them as a share of that between them.
+
+    The mean of a model that was fitted to a flattened output is too flat.
+
+    With a finer look the knots are first moved to where they explain most.
+    """
+    m = r.mean
+    low, high = knot
+    if finer:
+        grid = np.quantile(m, np.linspace(0.02, 0.98, 25))
+        low, high = located_limits(r, lambda a, b: np.clip(m, a, b) - m, knot, grid, m[:, None])
+    there = r.held_out & np.isfinite(r.output)
+    columns = np.column_stack([np.ones(len(r)), m, np.clip(m, low, high) - m])
+    a, b, c = np.linalg.lstsq(columns[there], r.output[there], rcond=1e-8)[0]
+    return float(a + b * low), float(a + b * high), float((b - c) / b) if b else 1.0
+
+
+def _cut(top: Ties, bottom: Ties, low: float, high: float) -> float:
+    """Root mean square of what limits cut off."""
+    sizes = [t.size for t, at in ((bottom, low), (top, high)) if np.isfinite(at)]
+    return float(np.sqrt(np.square(sizes).sum()))

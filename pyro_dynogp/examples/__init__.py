@@ -1,0 +1,1 @@
+"""Data sets that ship, and simulated systems."""

@@ -1,0 +1,294 @@
+"""The log joint density of a Pyro model as a function of one unconstrained vector."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyro
+import torch
+from torch import Tensor
+from torch.distributions import biject_to
+from torch.distributions.transforms import Transform
+
+from pyro_dynogp.inference.optimise.descent import bounded_root, descend, hessian
+from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
+from pyro_dynogp.support.errors import invalid
+
+# Energy where there is no density.
+WALL = 1e15
+# Samples in all, over the points of a batch, up to which more points cost less than one by one:
+# above, the compiled recursions are what an evaluation costs.
+AT_ONCE = 12_000
+# Most iterations to the mode of the unconstrained vector's density.
+LAPLACE_STEPS = 120
+
+
+@dataclass(frozen=True)
+class Site:
+    """One latent sample site: its shape, and the map from unconstrained to constrained values."""
+
+    name: str
+    shape: torch.Size
+    unconstrained: torch.Size
+    transform: Transform
+
+
+def parts(sites: Sequence[Site], z: Tensor) -> Iterator[tuple[Site, Tensor]]:
+    """Each site with its part (*s, *unconstrained) of the vectors z (*s, d)."""
+    start = 0
+    for site in sites:
+        stop = start + site.unconstrained.numel()
+        yield site, z[..., start:stop].reshape(z.shape[:-1] + site.unconstrained)
+        start = stop
+
+
+def log_prob_by_draw(trace: Any, count: int) -> Tensor:
+    """Log-density (S,) of all sites of a trace, run at S draws at once and scored.
+
+    A site that no draw changes has one density for all of them.
+    """
+    total = torch.zeros(count, dtype=torch.float64)
+    for node in trace.nodes.values():
+        if node["type"] != "sample" or type(node["fn"]).__name__ == "_Subsample":
+            continue
+        log_prob = node["log_prob"]
+        several = log_prob.dim() > 0 and log_prob.shape[0] == count
+        total = total + (log_prob.reshape(count, -1).sum(1) if several else log_prob.sum())
+    return total
+
+
+def joint_energy(
+    model: Callable[..., Any],
+    args: tuple[Any, ...],
+    sites: Sequence[Site],
+    z: Tensor,
+    *,
+    jacobian: bool,
+) -> Tensor:
+    """-log p(y, values) at the unconstrained vector z (d,), or (k,) at vectors z (k, d) together.
+
+    With `jacobian` the density is that of the unconstrained vector.
+    """
+    values: dict[str, Tensor] = {}
+    log_jacobian = torch.zeros(z.shape[:-1], dtype=torch.float64)
+    for site, part in parts(sites, z):
+        value = site.transform(part)
+        values[site.name] = value
+        if jacobian:
+            each = site.transform.log_abs_det_jacobian(part, value)
+            log_jacobian = log_jacobian + each.reshape(*z.shape[:-1], -1).sum(-1)
+    trace = _scored(model, args, values)
+    log_joint = trace.log_prob_sum() if z.dim() == 1 else log_prob_by_draw(trace, len(z))
+    return -log_joint - log_jacobian
+
+
+def _scored(model: Callable[..., Any], args: tuple[Any, ...], values: Mapping[str, Tensor]) -> Any:
+    """Trace of a model at given values, with the log-density of every site."""
+    conditioned = pyro.poutine.condition(model, data=dict(values))
+    trace = pyro.poutine.trace(conditioned).get_trace(*args)
+    trace.compute_log_prob()
+    return trace
+
+
+def each_with_gradient(
+    energy: Callable[..., Tensor], z: Tensor, *more: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Energies (k,) at z (k, d) and their gradients (k, d), infinite and zero where there are none.
+
+    Where one point breaks the evaluation of all, it is found by halving. The energy is called with
+    z and with `more` (k, ...), a row for each point.
+    """
+    x = z.detach().requires_grad_()
+    try:
+        with torch.enable_grad(), pyro.validation_enabled(False), denormals_flushed():
+            value = energy(x, *more)
+            (gradient,) = torch.autograd.grad(value.sum(), x)
+    except (NotPositiveDefiniteError, torch.linalg.LinAlgError, ValueError):
+        if len(z) == 1:
+            return torch.full((1,), torch.inf, dtype=torch.float64), torch.zeros_like(z)
+        split = zip(*(one.tensor_split(2) for one in (z, *more)), strict=True)
+        halves = [each_with_gradient(energy, *half) for half in split]
+        return torch.cat([v for v, _ in halves]), torch.cat([g for _, g in halves])
+    bad = ~(torch.isfinite(value) & torch.isfinite(gradient).all(-1))
+    return value.detach().masked_fill(bad, torch.inf), gradient.masked_fill(bad[:, None], 0.0)
+
+
+@contextlib.contextmanager
+def denormals_flushed() -> Iterator[None]:
+    """Inside, numbers below 1e-308 are zero; outside nothing has changed.
+
+    What an unknown first state leaves decays through that range along a record, and processors are
+    many times slower there.
+    """
+    before = not bool(torch.tensor(1e-310, dtype=torch.float64) * 1.0)
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(before)
+
+
+class Potential:
+    """Sites of a model given its arguments, and its log joint density.
+
+    A model whose class says ``takes_batches = True`` runs with values (k, *shape) of every site as
+    it does with one of each; several points then go through it together.
+
+    `nearly_normal` says whether the density is so close to normal that Laplace's approximation at
+    the mode is all the preparation that chains need.
+
+    Args:
+        model: a Pyro function. args: what it is called with.
+        values: a value for every latent site, at which the model is traced once.
+
+    Raises:
+        ValueError: where a latent site has no value.
+    """
+
+    nearly_normal = False
+
+    def __init__(
+        self, model: Callable[..., Any], args: tuple[Any, ...], values: Mapping[str, Tensor]
+    ) -> None:
+        self.model, self.args, self.at = model, args, dict(values)
+        trace = pyro.poutine.trace(pyro.poutine.condition(model, data=dict(values))).get_trace(
+            *args
+        )
+        unset = [
+            name
+            for name, node in trace.nodes.items()
+            if node["type"] == "sample" and not node["is_observed"]
+        ]
+        if unset:
+            raise invalid(
+                "values", expected=f"a value for every latent site, {unset} too", got="none"
+            )
+        self.sites: list[Site] = []
+        for name, node in trace.nodes.items():
+            if node["type"] == "sample" and name in values:
+                value = node["value"].detach()
+                transform = biject_to(node["fn"].support)
+                self.sites.append(Site(name, value.shape, transform.inv(value).shape, transform))
+        observed = [node["value"] for node in trace.nodes.values()
+                    if node["type"] == "sample" and node["is_observed"]]  # fmt: skip
+        count = sum(y.numel() for y in observed if torch.is_tensor(y))
+        # Points that are evaluated at once.
+        batches = getattr(model, "takes_batches", False)
+        self.width = max(1, AT_ONCE // max(count, 1)) if batches else 1
+
+    @property
+    def size(self) -> int:
+        """Length of the unconstrained vector."""
+        return sum(site.unconstrained.numel() for site in self.sites)
+
+    @property
+    def hessian_cost(self) -> int:
+        """Evaluations, of `width` points each, that one-sided differences take for a Hessian."""
+        return -(-self.size // self.width)
+
+    def pack(self, values: Mapping[str, Tensor]) -> Tensor:
+        """Constrained values of every site to the unconstrained vector (d,), finite.
+
+        A mode may lie on a boundary to the last digit, where the vector would be infinite.
+        """
+        parts = [site.transform.inv(values[site.name]).reshape(-1) for site in self.sites]
+        return torch.cat(parts).detach().nan_to_num(nan=math.nan, posinf=EDGE, neginf=-EDGE)
+
+    def unpack(self, z: Tensor) -> dict[str, Tensor]:
+        """Unconstrained vectors (*s, d) to constrained values (*s, *shape) of every site."""
+        return {site.name: site.transform(part) for site, part in parts(self.sites, z)}
+
+    def log_joint(self, values: Mapping[str, Tensor]) -> Tensor:
+        """Log p(y, values), of constrained values."""
+        return _scored(self.model, self.args, values).log_prob_sum()
+
+    def energy(
+        self, z: Tensor, *, jacobian: bool, inputs: Sequence[Tensor] | None = None
+    ) -> Tensor:
+        """-log density at z (d,) or, of a model that takes batches, (k,) at z (k, d).
+
+        Of the values, or with `jacobian` of the unconstrained vector. With `inputs`, for each
+        record (k, n, n_u) or (n, n_u), each point has inputs of its own.
+        """
+        args = self.args if inputs is None else (*self.args, inputs)
+        return joint_energy(self.model, args, self.sites, z, jacobian=jacobian)
+
+    def value_and_gradient(
+        self, z: np.ndarray, *, jacobian: bool = False
+    ) -> tuple[float, np.ndarray]:
+        """Energy and its gradient at z (d,).
+
+        Where the density cannot be evaluated (a covariance singular to rounding, a number out of
+        range) the energy is so high that a line search steps back.
+        """
+        values, gradients = self.values_and_gradients(z[None], jacobian=jacobian)
+        return float(values[0]), gradients[0]
+
+    def values_and_gradients(
+        self, z: np.ndarray, *, jacobian: bool = False, inputs: Sequence[Tensor] | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Energies (k,) and their gradients (k, d) at z (k, d), as `value_and_gradient` has them.
+
+        A model that takes batches is evaluated at `width` points at once. `inputs` as of `energy`.
+        """
+
+        def energy(x: Tensor, *u: Tensor) -> Tensor:
+            one = len(x) == 1
+            given = [each[0] if one else each for each in u] or None
+            if one:
+                return self.energy(x[0], jacobian=jacobian, inputs=given)[None]
+            return self.energy(x, jacobian=jacobian, inputs=given)
+
+        points = torch.tensor(z, dtype=torch.float64)
+        batches = zip(*(one.split(self.width) for one in (points, *(inputs or ()))), strict=True)
+        found = [each_with_gradient(energy, *batch) for batch in batches]
+        values = torch.cat([value for value, _ in found]).numpy()
+        values[np.isinf(values)] = WALL
+        return values, torch.cat([gradient for _, gradient in found]).numpy()
+
+    def hessian(self, z: np.ndarray, *, step: float = 1e-4) -> np.ndarray:
+        """Hessian (d, d) of the energy with Jacobian, by central differences of the gradient."""
+        return self.hessian_of(z, range(z.shape[0]), step=step)
+
+    def hessian_of(self, z: np.ndarray, some: Sequence[int], *, step: float = 1e-4) -> np.ndarray:
+        """Rows and columns of `hessian` that belong to some entries of z."""
+        return hessian(self.with_jacobian, z, some, step=step)
+
+    def with_jacobian(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Energies (k,) and gradients (k, d) of the unconstrained vector's density."""
+        return self.values_and_gradients(z, jacobian=True)
+
+    def log_evidence(self, values: Mapping[str, Tensor], *, widest: float) -> float:
+        """Laplace's approximation of log p(y) from the neighbourhood of `values` alone [nats].
+
+        A Gaussian integral of the unconstrained vector's density with the curvature there: by it
+        optima of one model are compared, of which a high one may be a needle. Directions that are
+        flatter than a standard deviation of `widest` count as that wide (Tierney & Kadane 1986).
+        """
+        z = self.pack(values).numpy()
+        energy = self.value_and_gradient(z, jacobian=True)[0]
+        curvature = np.maximum(np.linalg.eigvalsh(self.hessian(z, step=1e-3)), widest**-2)
+        return float(-energy - 0.5 * np.log(curvature / (2.0 * math.pi)).sum())
+
+    def laplace(
+        self, values: Mapping[str, Tensor], *, widest: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Centre (d,) and root (d, d) of the Laplace approximation of the unconstrained vector.
+
+        The centre is the mode of that vector's own density (with Jacobian), climbed to from
+        `values`: the mode of the constrained density can lie on a boundary, at minus infinity.
+        """
+        every = self.hessian_cost
+        z, _, _ = descend(
+            self.with_jacobian, self.pack(values).numpy(), LAPLACE_STEPS, every=every, first=0
+        )
+        return z, bounded_root(self.hessian(z), widest=widest)
+
+
+# Unconstrained value of what lies on a boundary: within 1e-13 of it.
+EDGE = 30.0

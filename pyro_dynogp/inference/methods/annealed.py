@@ -1,0 +1,269 @@
+r"""Annealed sequential Monte Carlo: particles carried from one density to another, all at once.
+
+Particles of a density p_0 follow p_0^{1-b} p_1^b from b = 0 to 1. Each step of b is as long as half
+of them stay effective; they are resampled, and moved by Hamiltonian Monte Carlo in coordinates
+whitened by their own covariance (Del Moral, Doucet & Jasra 2006; Buchholz, Chopin & Jacob 2021).
+What comes out are draws of p_1 and the ratio of the two normalising constants. No normal shape is
+assumed: ridges and pairs that swap places are no obstacle where the particles of p_0 cover them.
+
+All particles go through the model together, so that one evaluation costs little more than the
+compiled recursions do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from pyro.distributions import MultivariateStudentT
+from torch import Tensor
+from tqdm import tqdm
+
+from pyro_dynogp.inference.density import Site, each_with_gradient, joint_energy
+from pyro_dynogp.inference.posteriors import GaussianGuide
+
+# Effective share of particles after a step; Hamiltonian moves at each temperature, and at the end.
+EFFECTIVE, MOVES, LAST_MOVES = 0.5, 2, 4
+# Leapfrog steps of a move, at random between these; acceptance that the step size aims at.
+LEAPS, ACCEPTANCE = (4, 12), 0.8
+MOST_TEMPERATURES = 60
+# Degrees of freedom of the first particles around an optimum: tails wider than a normal's.
+FREEDOM = 5.0
+
+# Unconstrained values (logarithms of scales, mostly) beyond which a density counts as zero.
+REACH = 40.0
+
+
+class Density(Protocol):
+    """Log-density (S,) of unconstrained vectors z (S, d), up to a constant, and its gradient."""
+
+    def __call__(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Value (S,), -inf where there is none, and gradient (S, d)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """Log p(y, values) of a Pyro model with the Jacobian of the unconstrained vector.
+
+    Attributes:
+        model, args: the model and what it is called with. sites: of the vector.
+    """
+
+    model: Any
+    args: tuple[Any, ...]
+    sites: Sequence[Site]
+
+    def __call__(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Value (S,) and gradient (S, d)."""
+        far = ~(z.abs() <= REACH).all(-1)
+        energy, slope = each_with_gradient(self._energy, z.masked_fill(far[:, None], 0.0))
+        return -energy.masked_fill(far, torch.inf), -slope.masked_fill(far[:, None], 0.0)
+
+    def _energy(self, z: Tensor) -> Tensor:
+        return joint_energy(self.model, self.args, self.sites, z, jacobian=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Student:
+    """Multivariate Student-t around an optimum, with the scale of a normal there."""
+
+    loc: Tensor
+    scale_tril: Tensor
+
+    @property
+    def distribution(self) -> MultivariateStudentT:
+        """As Pyro has it."""
+        return MultivariateStudentT(
+            torch.tensor(FREEDOM, dtype=torch.float64), self.loc, self.scale_tril
+        )
+
+    def __call__(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Value (S,) and gradient (S, d)."""
+        departure = torch.cholesky_solve((z - self.loc).unsqueeze(-1), self.scale_tril).squeeze(-1)
+        square = ((z - self.loc) * departure).sum(-1, keepdim=True)
+        gradient = -(FREEDOM + z.shape[-1]) * departure / (FREEDOM + square)
+        return self.distribution.log_prob(z), gradient
+
+
+@dataclass(frozen=True, eq=False)
+class Annealed:
+    """Particles of the target.
+
+    Attributes:
+        z: (S, d) unconstrained. log_evidence: log of the target's normalising constant over the
+            start's.
+        temperatures: b after each step. acceptance: of the moves at each.
+        ancestor: (S,) first particle that each one descends from.
+    """
+
+    z: Tensor
+    log_evidence: float
+    temperatures: tuple[float, ...]
+    acceptance: tuple[float, ...]
+    ancestor: np.ndarray
+
+
+def anneal(
+    z: Tensor, start: Density, target: Density, *, seed: int = 0, progress: bool = False
+) -> Annealed:
+    """Carry particles z (S, d) of `start` to `target`.
+
+    Raises:
+        RuntimeError: where no particle has a density under the target, or the steps become too
+            many: the start is too far from the target.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    count = len(z)
+    ancestor = torch.arange(count)
+    now = _evaluate(z, start, target)
+    b, log_evidence, size = 0.0, 0.0, 0.5
+    temperatures: list[float] = []
+    accepted: list[float] = []
+    bar = tqdm(desc="annealing", disable=not progress, total=100)
+    while b < 1.0:
+        if len(temperatures) == MOST_TEMPERATURES:
+            raise RuntimeError(
+                f"annealing: after {MOST_TEMPERATURES} steps the temperature is {b:.3g} of 1. The "
+                "posterior is too far from where the particles start: use method='nuts'."
+            )
+        gain = now.target - now.start
+        if not bool(torch.isfinite(gain).any()):
+            raise RuntimeError("annealing: no particle has a density under the target.")
+        step = _step(gain, 1.0 - b)
+        weight = step * gain
+        log_evidence += float(torch.logsumexp(weight, 0)) - float(np.log(count))
+        chosen = _resample(weight, generator)
+        now, ancestor = now.of(chosen), ancestor[chosen]
+        b = 1.0 if b + step > 1.0 - 1e-9 else b + step
+        root = _root(now.z)
+        rates = []
+        for _ in range(MOVES if b < 1.0 else LAST_MOVES):
+            now, rate = _move(now, start, target, b, root, size, generator)
+            # Particles tell at once how many of them were accepted.
+            size = float(np.clip(size * np.exp(rate - ACCEPTANCE), 1e-3, 1.5))
+            rates.append(rate)
+        temperatures.append(b)
+        accepted.append(float(np.mean(rates)))
+        bar.update(round(100 * b) - bar.n)
+    bar.close()
+    return Annealed(
+        now.z, log_evidence, tuple(temperatures), tuple(accepted), ancestor.numpy().copy()
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Particles:
+    """Vectors with both densities and their gradients."""
+
+    z: Tensor
+    start: Tensor
+    target: Tensor
+    start_gradient: Tensor
+    target_gradient: Tensor
+
+    def of(self, index: Tensor) -> _Particles:
+        return _Particles(*(x[index] for x in self._all()))
+
+    def where(self, condition: Tensor, other: _Particles) -> _Particles:
+        pairs = zip(self._all(), other._all(), strict=True)
+        return _Particles(
+            *(
+                torch.where(condition if a.dim() == 1 else condition[:, None], a, b)
+                for a, b in pairs
+            )
+        )
+
+    def _all(self) -> tuple[Tensor, ...]:
+        return self.z, self.start, self.target, self.start_gradient, self.target_gradient
+
+    def at(self, b: float) -> tuple[Tensor, Tensor]:
+        """Log-density (S,) and gradient (S, d) at temperature b."""
+        value = b * self.target + (1.0 - b) * self.start if b < 1.0 else self.target
+        return value, b * self.target_gradient + (1.0 - b) * self.start_gradient
+
+
+def _evaluate(z: Tensor, start: Density, target: Density) -> _Particles:
+    first, first_gradient = start(z)
+    last, last_gradient = target(z)
+    return _Particles(z, first, last, first_gradient, last_gradient)
+
+
+def _step(gain: Tensor, most: float) -> float:
+    """Longest step at which EFFECTIVE of the particles stay effective, by bisection."""
+
+    def effective(step: float) -> float:
+        w = torch.softmax(step * gain, 0)
+        return float(1.0 / w.square().sum()) / len(gain)
+
+    if effective(most) >= EFFECTIVE:
+        return most
+    low, high = 0.0, most
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if effective(middle) >= EFFECTIVE else (low, middle)
+    # Where less than half of them have any density the first step only drops the others.
+    return max(low, 1e-6 * most)
+
+
+def _resample(log_weight: Tensor, generator: torch.Generator) -> Tensor:
+    """Systematic resampling: indices (S,)."""
+    count = len(log_weight)
+    edges = torch.cumsum(torch.softmax(log_weight, 0), 0)
+    shift = torch.rand((), generator=generator, dtype=torch.float64)
+    at = (torch.arange(count, dtype=torch.float64) + shift) / count * edges[-1]
+    return torch.searchsorted(edges, at).clamp_max(count - 1)
+
+
+def _root(z: Tensor) -> Tensor:
+    """Cholesky factor (d, d) of the particles' covariance, shrunk to its diagonal."""
+    count, d = z.shape
+    covariance = torch.cov(z.mT).reshape(d, d)
+    share = d / (d + count)
+    diagonal = covariance.diagonal().clamp_min(1e-12)
+    return torch.linalg.cholesky((1.0 - share) * covariance + share * torch.diag(diagonal))
+
+
+def _move(
+    now: _Particles,
+    start: Density,
+    target: Density,
+    b: float,
+    root: Tensor,
+    size: float,
+    generator: torch.Generator,
+) -> tuple[_Particles, float]:
+    """One Hamiltonian move of every particle, and the share that was accepted."""
+    count, d = now.z.shape
+    low, high = LEAPS
+    leaps = int(torch.randint(low, high + 1, (), generator=generator))
+    jitter = 0.7 + 0.6 * torch.rand(count, 1, generator=generator, dtype=torch.float64)
+    h = size * jitter * d**-0.25
+    momentum = torch.randn(count, d, generator=generator, dtype=torch.float64)
+    value, gradient = now.at(b)
+    energy = value - 0.5 * momentum.square().sum(-1)
+    there = now
+    for leap in range(leaps):
+        momentum = momentum + (0.5 if leap == 0 else 1.0) * h * (gradient @ root)
+        there = _evaluate(there.z + (h * momentum) @ root.mT, start, target)
+        value, gradient = there.at(b)
+    momentum = momentum + 0.5 * h * (gradient @ root)
+    change = value - 0.5 * momentum.square().sum(-1) - energy
+    change = torch.nan_to_num(change, nan=-torch.inf)
+    chance = torch.rand(count, generator=generator, dtype=torch.float64).log()
+    accept = chance < change
+    rate = float(change.clamp_max(0.0).exp().mean())
+    return there.where(accept, now), rate
+
+
+def around(guide: GaussianGuide, count: int, seed: int) -> tuple[Tensor, Student]:
+    """First particles (S, d) around a normal, and their density."""
+    student = Student(guide.loc, guide.scale_tril)
+    generator = torch.Generator().manual_seed(seed)
+    normal = torch.randn(count, len(guide.loc), generator=generator, dtype=torch.float64)
+    # A chi-squared number by the sum of squares: torch's gamma takes no generator.
+    squares = torch.randn(count, int(FREEDOM), generator=generator, dtype=torch.float64)
+    spread = (FREEDOM / squares.square().sum(-1, keepdim=True)).sqrt()
+    return guide.loc + spread * (normal @ guide.scale_tril.mT), student

@@ -1,0 +1,188 @@
+"""Training of cascades: linear fits first, then all layers together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.inference.optimise.maximum import Optimizer, Optimum, maximise
+from pyro_dynogp.inference.starts.plans import (
+    Values,
+    leading_layers,
+    linear_twin,
+    plans,
+    starting_point,
+)
+from pyro_dynogp.inference.starts.poles import grown, starting_values
+from pyro_dynogp.layers.noise import TYPICAL
+from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.models.wiring import Dynamic, Static
+from pyro_dynogp.support.checkpoints import NOTHING_KEPT, Checkpoints
+from pyro_dynogp.support.parallel import seeded
+
+GuideChoice = str | Mapping[str, Any] | Callable[..., Any] | None
+
+# Starts and iterations of the linear fits that come first.
+LINEAR_STARTS = 6
+LINEAR_STEPS = 150
+# Measurement noise, in sds of the outputs, from which starts without process noise climb at least.
+UNEXPLAINED = 0.5
+
+
+def starting_points(
+    model: Cascade,
+    records: Sequence[Record],
+    count: int,
+    steps: int,
+    seed: int,
+    workers: int | None,
+    progress: bool,
+    checkpoints: Checkpoints,
+) -> list[Values]:
+    """Values of every site for each restart, from the optima of linear fits."""
+    assert model.scaling is not None
+    optima: dict[str, Sequence[Values]] = {}
+    known: dict[Any, Sequence[Values]] = {}
+    for one in leading_layers(model):
+        assert isinstance(one.layer, Dynamic)
+        twin = linear_twin(model, one.layer, model.scaling)
+        if twin not in known:
+            training = _one_output(records) if twin.outputs < model.outputs else tuple(records)
+            twin = twin.scaled_to(training)
+            found = maximise(
+                twin,
+                training if len(training) > 1 else training[0],
+                starting_values(twin, training, count=LINEAR_STARTS, seed=seed),
+                steps=min(LINEAR_STEPS, steps),
+                seed=seed,
+                workers=workers,
+                progress=progress,
+                checkpoints=checkpoints,
+                key=f"linear-{one.name}",
+            )
+            known[twin] = [optimum.values for optimum in found]
+        optima[one.name] = known[twin]
+    with seeded(seed):  # what has no typical value is drawn
+        return [
+            starting_point(model, records, model.scaling, plan)
+            for plan in plans(model, optima, count, seed)
+        ]
+
+
+def deterministic(model: Cascade) -> Cascade:
+    """The model without process noise, but in layers that nothing else drives."""
+    layers = tuple(
+        replace(layer, process_noise=False, name=one.name)
+        if isinstance(layer, Dynamic) and layer.process_noise and one.channels
+        else layer
+        for one, layer in zip(model.wires, model.layers, strict=True)
+    )
+    return replace(model, layers=layers)
+
+
+def without_process_noise(model: Cascade) -> Cascade:
+    """The model with deterministic dynamics; the same one where no static layer sees noise.
+
+    Layers that nothing else drives keep their process noise.
+    """
+    static = [place for place, one in enumerate(model.layers) if isinstance(one, Static)]
+    last = static[-1] if static else 0
+    seen = any(isinstance(one, Dynamic) and one.process_noise for one in model.layers[:last])
+    return deterministic(model) if seen else model
+
+
+def _louder(values: Values) -> Values:
+    """A start whose measurement noise can stand for what dynamics and functions lack as yet.
+
+    Linear fits leave that to process noise. Without any, noise of their size makes the density so
+    steep that the climb ends on its slopes.
+    """
+    least = {"noise_sd": UNEXPLAINED, "log_noise_constant": math.log(UNEXPLAINED / TYPICAL)}
+    return {
+        name: value.clamp_min(least[name]) if name in least else value
+        for name, value in values.items()
+    }
+
+
+def _one_output(records: Sequence[Record]) -> tuple[Record, ...]:
+    return tuple(record.select(outputs=[record.output_names[0]]) for record in records)
+
+
+def best_optima(
+    model: Cascade,
+    records: Sequence[Record],
+    restarts: int,
+    steps: int,
+    optimizer: Optimizer,
+    seed: int,
+    workers: int | None,
+    progress: bool,
+    checkpoints: Checkpoints,
+    learnt: Values | None = None,
+) -> list[Optimum]:
+    """Optima of the collapsed model from all starts, and from what is learnt, best first."""
+    starts = starting_points(model, records, restarts, steps, seed, workers, progress, checkpoints)
+    return climb(
+        model,
+        records[0] if len(records) == 1 else tuple(records),
+        starts,
+        [] if learnt is None else [grown(learnt, starts[0])],
+        optimizer=optimizer,
+        steps=steps,
+        seed=seed,
+        workers=workers,
+        progress=progress,
+        checkpoints=checkpoints,
+    )
+
+
+def climb(
+    model: Cascade,
+    records: Record | Sequence[Record],
+    starts: Sequence[Values],
+    learnt: Sequence[Values],
+    *,
+    steps: int,
+    checkpoints: Checkpoints = NOTHING_KEPT,
+    **options: Any,
+) -> list[Optimum]:
+    """Optima of the collapsed model from fresh starts and from what is learnt, best first.
+
+    Where static layers see process noise fresh starts take half of the steps without any, which
+    needs no filter, and the better half of them takes the other half with it. Such noise can
+    explain all that dynamics and functions should: from a poor start to a high density and poor
+    forecasts.
+    """
+    options |= {"checkpoints": checkpoints, "kept": 0.5}
+    quiet = without_process_noise(model)
+    if quiet != model and starts:
+        steps = max(1, steps // 2)
+        key = "without-process-noise"
+        louder = [_louder(start) for start in starts]
+        found = maximise(quiet, records, louder, steps=steps, key=key, **options)
+        better = found[: (len(starts) + 1) // 2]
+        starts = [grown(one.values, starts[0]) for one in better]
+    return maximise(model, records, [*learnt, *starts], steps=steps, key="cascade", **options)
+
+
+def grow(
+    model: Cascade, record: Record, learnt: Values, start: Values, *, steps: int, seed: int
+) -> list[Optimum]:
+    """Optima of the collapsed model near what a smaller model, or the same one, has learnt.
+
+    Process noise that has explained what the smaller model lacks keeps the larger one from
+    explaining it: one climb goes without any first, and takes that of `start` then.
+    """
+    options: dict[str, Any] = {
+        "steps": steps, "seed": seed, "workers": 1, "optimizer": "preconditioned",
+    }  # fmt: skip
+    starts = [learnt]
+    quiet = without_process_noise(model)
+    if quiet != model:
+        (found, *_) = maximise(quiet, record, [_louder(learnt)], key="grown-quiet", **options)
+        starts.append(grown(found.values, start))
+    optima = [maximise(model, record, [one], key="grown", **options)[0] for one in starts]
+    return sorted(optima, key=lambda one: one.energy)

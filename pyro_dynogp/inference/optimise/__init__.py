@@ -1,0 +1,1 @@
+"""Climbing to posterior modes."""

@@ -1,0 +1,262 @@
+"""Posterior mode of the exact marginal model: several starts, the best one kept."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pyro_dynogp.data.record import Record, as_records
+from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.optimise.descent import descend, lbfgs
+from pyro_dynogp.inference.optimise.lockstep import Functions, in_lockstep
+from pyro_dynogp.support.checkpoints import (
+    NOTHING_KEPT,
+    Checkpoints,
+    Piece,
+    tensor_text,
+    text_tensor,
+)
+from pyro_dynogp.support.parallel import parallel_map, seeded
+
+Optimizer = Literal["lbfgs", "preconditioned", "adam"]
+# Adam's first step, and how often it goes back to the best point with a shorter one.
+RATE, RETURNS = 0.02, 2
+# Starts that climb together, as long as they have no more samples than this in all: longer records
+# keep a processor busy one by one.
+TOGETHER, BATCH_SAMPLES = 4, 8000
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """What one start came to.
+
+    Attributes:
+        energy: -log p(y, values), the lower the better.
+        values: value of every latent site.
+        history: energy after each iteration.
+        message: why the optimiser stopped.
+    """
+
+    energy: float
+    values: dict[str, Tensor]
+    history: np.ndarray
+    message: str
+
+
+@dataclass(frozen=True)
+class _Task:
+    """Starts that climb together; `goes_on` says that they have climbed already."""
+
+    model: Any
+    records: Record | Sequence[Record]
+    starts: tuple[dict[str, Tensor], ...]
+    optimizer: Optimizer
+    steps: int
+    seed: int
+    checkpoints: Checkpoints
+    key: str
+    rate: float
+    goes_on: bool
+
+
+def _lbfgs(
+    functions: Functions, z: np.ndarray, task: _Task, every: int
+) -> tuple[np.ndarray, list, str]:
+    del every  # of Hessians, of which it has none
+    history: list[float] = []
+    result = lbfgs(functions, z, task.steps, history, maxfun=2 * task.steps, ftol=1e-7)
+    return result.x, history, str(result.message)
+
+
+def _preconditioned(
+    functions: Functions, z: np.ndarray, task: _Task, every: int
+) -> tuple[np.ndarray, list, str]:
+    return descend(functions, z, task.steps, every=every, first=0 if task.goes_on else None)
+
+
+def _adam(
+    functions: Functions, z: np.ndarray, task: _Task, every: int
+) -> tuple[np.ndarray, list, str]:
+    """Adam with a falling step; back to the best point with a shorter one where it got lost.
+
+    Its first steps have full length in every direction, however good the start is.
+    """
+    del every  # of Hessians, of which it has none
+    steps, rate = task.steps, task.rate
+    x, optimizer, schedule = _from(z, rate, steps)
+    history: list[float] = []
+    best, best_z = np.inf, z
+    patience = max(50, steps // 10)
+    since, returns = 0, 0
+    for done in range(steps):
+        here = x.detach().numpy().copy()
+        values, gradients = functions(here[None])
+        value = float(values[0])
+        history.append(value)
+        since += 1
+        if value < best - 1e-3:
+            since = 0
+        if value < best:
+            best, best_z = value, here
+        if since > patience:
+            if returns == RETURNS:
+                return best_z, history, "no improvement of 0.001 nats within the patience"
+            returns, since, rate = returns + 1, 0, rate / 4.0
+            x, optimizer, schedule = _from(best_z, rate, steps - done)
+            continue
+        x.grad = torch.tensor(gradients[0])
+        optimizer.step()
+        schedule.step()
+    return best_z, history, "all steps used"
+
+
+def _from(z: np.ndarray, rate: float, steps: int) -> tuple[Tensor, Any, Any]:
+    """Adam at a point, with a step that falls over the steps that are left."""
+    x = torch.tensor(z, dtype=torch.float64, requires_grad=True)
+    optimizer = torch.optim.Adam([x], lr=rate)
+    low = min(1e-4, 0.1 * rate)
+    return x, optimizer, torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps, eta_min=low)
+
+
+_METHODS = {"lbfgs": _lbfgs, "preconditioned": _preconditioned, "adam": _adam}
+
+
+def _optimise(task: _Task) -> list[Optimum]:
+    return _unpack(task.checkpoints.piece(task.key, lambda: _pack(_climb(task))))
+
+
+def _climb(task: _Task) -> list[Optimum]:
+    with seeded(task.seed):
+        potential = Potential(task.model, (task.records,), task.starts[0])
+        method = _METHODS[task.optimizer]
+        every = potential.hessian_cost  # of a climb, Hessians are at most half the work
+
+        def run(start: dict[str, Tensor]) -> Callable[[Functions], tuple[np.ndarray, list, str]]:
+            z = potential.pack(start).numpy()
+            return lambda functions: method(functions, z, task, every)
+
+        found = in_lockstep(potential.values_and_gradients, [run(start) for start in task.starts])
+        ends = np.stack([z for z, _, _ in found])
+        energies = potential.values_and_gradients(ends)[0]
+        return [
+            Optimum(float(energy), _values(potential, z), np.asarray(history), message)
+            for energy, (z, history, message) in zip(energies, found, strict=True)
+        ]
+
+
+def _values(potential: Potential, z: np.ndarray) -> dict[str, Tensor]:
+    return {k: v.detach() for k, v in potential.unpack(torch.tensor(z)).items()}
+
+
+def _pack(optima: Sequence[Optimum]) -> Piece:
+    piece: Piece = {}
+    for i, one in enumerate(optima):
+        piece[f"{i}/energy"] = torch.tensor(one.energy, dtype=torch.float64)
+        piece[f"{i}/history"] = torch.tensor(one.history, dtype=torch.float64)
+        piece[f"{i}/message"] = text_tensor(one.message)
+        piece |= {f"{i}/value/{name}": value for name, value in one.values.items()}
+    return piece
+
+
+def _unpack(piece: Piece) -> list[Optimum]:
+    optima: list[Optimum] = []
+    while f"{len(optima)}/energy" in piece:
+        own = f"{len(optima)}/"
+        mark = f"{own}value/"
+        values = {k.removeprefix(mark): v for k, v in piece.items() if k.startswith(mark)}
+        energy, history = float(piece[f"{own}energy"]), piece[f"{own}history"].numpy()
+        optima.append(Optimum(energy, values, history, tensor_text(piece[f"{own}message"])))
+    return optima
+
+
+def _batches(
+    starts: Sequence[dict[str, Tensor]],
+    model: Any,
+    records: Record | Sequence[Record],
+    together: int,
+) -> list[tuple[dict[str, Tensor], ...]]:
+    """Starts in batches of nearly one size."""
+    outputs = sum(len(one) * max(one.n_outputs, 1) for one in as_records(records))
+    pays = BATCH_SAMPLES // outputs if getattr(model, "takes_batches", False) else 1
+    count = -(-len(starts) // max(1, min(together, pays)))
+    edges = np.linspace(0, len(starts), count + 1).round().astype(int)
+    return [tuple(starts[a:b]) for a, b in itertools.pairwise(edges)]
+
+
+def maximise(
+    model: Any,
+    records: Record | Sequence[Record],
+    starts: Sequence[dict[str, Tensor]],
+    *,
+    optimizer: Optimizer = "lbfgs",
+    steps: int = 500,
+    seed: int = 0,
+    workers: int | None = None,
+    progress: bool = False,
+    checkpoints: Checkpoints = NOTHING_KEPT,
+    key: str = "optimum",
+    kept: float = 1 / 3,
+    rate: float = RATE,
+    together: int = TOGETHER,
+    near: bool = False,
+) -> list[Optimum]:
+    """Climb from every start; the optima sorted by energy, best first.
+
+    All starts get a fifth of the steps, then the best of them, the share `kept`, the rest
+    (successive halving: a start that is far behind by then hardly ever wins). The mode is that of
+    the density of the constrained values (no Jacobian), as AutoDelta has it. `rate` is Adam's
+    first step, in unconstrained units. Starts are `near` their optima where others have climbed
+    before: optimisers that make use of the curvature do so at once. Up to `together` starts climb
+    side by side where evaluating them at once pays; how many does not depend on the number of
+    processors, nor does the result.
+    """
+
+    def climb(values: Sequence[dict[str, Tensor]], count: int, label: str) -> list[Optimum]:
+        tasks = [
+            _Task(
+                model,
+                records,
+                batch,
+                optimizer,
+                count,
+                seed,
+                checkpoints,
+                f"{key}-{label}-{i}",
+                rate,
+                near or label == "optima",
+            )
+            for i, batch in enumerate(_batches(values, model, records, together))
+        ]
+        found = parallel_map(
+            _optimise,
+            tasks,
+            workers=workers,
+            progress=progress,
+            description=f"{len(values)} {label}",
+            news=lambda done: f"log p {-min(o.energy for batch in done for o in batch):.2f}",
+        )
+        return [optimum for batch in found for optimum in batch]
+
+    def best_first(optima: list[Optimum]) -> list[Optimum]:
+        return sorted(optima, key=lambda optimum: optimum.energy)
+
+    if len(starts) == 1:
+        return climb(starts, steps, "optimum")
+    short = max(1, steps // 5)
+    first = best_first(climb(starts, short, "starts"))
+    if steps <= short:
+        return first
+    cut = max(1, round(kept * len(first)))
+    leading = first[:cut]
+    further = climb([optimum.values for optimum in leading], steps - short, "optima")
+    joined = [
+        replace(after, history=np.concatenate([before.history, after.history]))
+        for before, after in zip(leading, further, strict=True)
+    ]
+    return best_first([*joined, *first[cut:]])

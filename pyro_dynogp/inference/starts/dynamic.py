@@ -1,0 +1,124 @@
+"""Starting values of one dynamic layer: a linear fit's, or its input passed on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pyro
+import torch
+from torch import Tensor
+
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.scaling import Scaling
+from pyro_dynogp.inference.starts.poles import random_poles
+from pyro_dynogp.lti.response import mean_response
+from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.models.priors import TimeScale
+from pyro_dynogp.models.wiring import Dynamic, Wire
+
+Values = dict[str, Tensor]
+# Size of gains that are there to be learnt.
+SMALL = 0.05
+
+
+class DynamicStart:
+    """Starting values of one dynamic layer.
+
+    Args:
+        model: the cascade. one, layer: the dynamic layer and its place in it.
+        scaling: of the records. generator: of everything random.
+    """
+
+    def __init__(
+        self,
+        model: Cascade,
+        one: Wire,
+        layer: Dynamic,
+        scaling: Scaling,
+        generator: np.random.Generator,
+    ) -> None:
+        self.model, self.one, self.layer = model, one, layer
+        self.scaling, self.generator = scaling, generator
+
+    def _key(self, name: str) -> str:
+        return f"{self.one.name}_{name}"
+
+    def _random(self, *shape: int, scale: float = SMALL) -> Tensor:
+        return torch.tensor(scale * self.generator.standard_normal(shape), dtype=torch.float64)
+
+    def from_linear(self, linear: Mapping[str, Tensor]) -> Values:
+        """The linear optimum's values under this layer's names."""
+        values = {
+            self.one.name + name[1:]: value for name, value in linear.items() if name[:2] == "g_"
+        }
+        layer = self.layer
+        if layer.outputs > 1 and self._key("output_gain") not in values:
+            # One signal is the linear fit; the others see the same modes with other gains.
+            P = layer.pairs
+            gain = self._random(layer.outputs, P, 2, scale=0.7)
+            gain[0] = torch.tensor([1.0, 0.0], dtype=torch.float64)
+            values[self._key("output_gain")] = gain
+            length = gain.square().sum((0, -1)).sqrt()  # directions have unit length
+            values[self._key("input_gain")] = (
+                values[self._key("input_gain")] * length[:, None, None]
+            )
+            if layer.feedthrough:
+                D = values[self._key("feedthrough")]
+                rest = self._random(layer.outputs - 1, D.shape[-1], scale=0.1)
+                values[self._key("feedthrough")] = torch.cat([D.reshape(1, -1), rest])
+            if layer.process_noise:
+                values.update(self._small_noise())
+        if not layer.process_noise:
+            values = {k: v for k, v in values.items() if "_noise_gain" not in k}
+        return values
+
+    def near_identity(self) -> Values:
+        """Each output is an input, beside small random dynamics."""
+        layer, d = self.layer, self.one.channels
+        P, several = layer.pairs, layer.outputs > 1
+        rate = TimeScale.of(self.scaling).typical_rate
+        poles = random_poles(P, self.scaling, self.generator)
+        values = {
+            self._key("log_decay"): torch.tensor(np.log(-poles.real / rate)),
+            self._key("log_frequency"): torch.tensor(np.log(poles.imag / rate)),
+        }
+        if d:
+            values[self._key("input_gain")] = self._random(P, d, 2)
+            if layer.feedthrough:
+                D = torch.eye(layer.outputs, d, dtype=torch.float64)
+                D = D + self._random(layer.outputs, d)
+                values[self._key("feedthrough")] = D if several else D[0]
+            else:  # the fastest pair passes the first input on
+                fastest = int(np.argmax(np.abs(poles)))
+                values[self._key("input_gain")][fastest, 0, 1] = 1.0
+        if several:
+            gain = self._random(layer.outputs, P, 2, scale=0.7)
+            gain[0] = gain[0] + torch.tensor([1.0, 0.0], dtype=torch.float64)
+            values[self._key("output_gain")] = gain
+        if layer.process_noise:
+            values.update(self._small_noise())
+        return values
+
+    def _small_noise(self) -> Values:
+        layer = self.layer
+        count = layer.brownian or layer.outputs
+        return {
+            self._key("noise_gain_local_scale"): torch.full((layer.pairs,), 0.5).double(),
+            self._key("noise_gain_unit"): self._random(layer.pairs, count, 2, scale=0.3).abs()
+            + 0.05,
+        }
+
+    def response(self, values: Values, record: Record, x: Tensor) -> Tensor:
+        """Mean trajectory (n, w) of the layer."""
+        with torch.no_grad(), pyro.poutine.block():
+            sample = pyro.poutine.condition(self.model.sample_dynamic_layer, data=values)
+            modes = sample(self.one, self.layer, TimeScale.of(self.scaling)).modes
+            out = mean_response(modes, record.time, x if modes.inputs else None).output
+        return out if modes.several_outputs else out.unsqueeze(-1)
+
+    def scale(self, values: Values, factor: float) -> None:
+        """Multiply the layer's output."""
+        for name in ("input_gain", "feedthrough", "noise_gain_unit"):
+            if self._key(name) in values:
+                values[self._key(name)] = values[self._key(name)] * factor

@@ -1,0 +1,235 @@
+"""Starting points of a cascade: the best linear fits, spread over its layers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyro
+import torch
+from torch import Tensor
+
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.scaling import Scaling
+from pyro_dynogp.inference.starts.dynamic import DynamicStart, Values
+from pyro_dynogp.inference.starts.static import start_static
+from pyro_dynogp.layers.noise import TYPICAL
+from pyro_dynogp.lti.grid import time_grid
+from pyro_dynogp.models.assembly import assemble
+from pyro_dynogp.models.linear import LinearDynamicGP
+from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.models.system import DynamicSystem, scaled_inputs, scaled_outputs, see
+from pyro_dynogp.models.wiring import INPUTS, Dynamic, Static, Wire
+from pyro_dynogp.moments import filtering, smoothing
+from pyro_dynogp.support.parallel import child_seeds
+
+
+def linear_twin(model: Cascade, layer: Dynamic, scaling: Scaling) -> LinearDynamicGP:
+    """The linear model whose optimum starts a dynamic layer."""
+    return LinearDynamicGP(
+        inputs=model.inputs,
+        direct=model.direct,
+        outputs=layer.outputs if layer.outputs == model.outputs else 1,
+        pairs=layer.pairs,
+        noise=layer.noise,
+        brownian=layer.brownian,
+        feedthrough=layer.feedthrough,
+        process_noise=layer.process_noise or model.inputs == model.direct,
+        scaling=scaling,
+    )
+
+
+def leading_layers(model: Cascade) -> tuple[Wire, ...]:
+    """Dynamic layers that can take over a linear fit: they see as many channels as inputs."""
+    return tuple(
+        one
+        for one in model.wires
+        if isinstance(one.layer, Dynamic) and one.channels == model.inputs - model.direct
+    )
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One restart: which layer takes over which linear optimum.
+
+    Attributes:
+        leading: name of the layer, None where there is none that can.
+        linear: values of the linear model's sites at an optimum.
+        curved: whether a last static layer starts as the mean of the output given its input;
+            else, as other static layers do, as a straight line.
+        seed: of everything random.
+    """
+
+    leading: str | None
+    linear: Mapping[str, Tensor] | None
+    curved: bool
+    seed: int
+
+
+def plans(
+    model: Cascade, optima: Mapping[str, Sequence[Mapping[str, Tensor]]], count: int, seed: int
+) -> list[Plan]:
+    """Restarts in turn over leading layers and optima of the linear fit.
+
+    A last static layer starts curved, but straight at every fourth restart: a straight start lets
+    the dynamics first imitate what the function should do, and seldom recovers.
+
+    Args:
+        optima: for each leading layer the linear optima, best first.
+    """
+    names = [one.name for one in leading_layers(model)]
+    seeds = child_seeds(seed, count)
+    if not names:
+        return [Plan(None, None, bool(index % 2), s) for index, s in enumerate(seeds)]
+    bends = isinstance(model.layers[-1], Static)
+    out = []
+    used = dict.fromkeys(names, 0)  # linear optima, best first
+    for index, s in enumerate(seeds):
+        name, turn = names[index % len(names)], index // len(names)
+        curved = bends and turn % 4 != 1
+        found = optima[name]
+        if bends and not curved:
+            linear = found[(turn // 4) % len(found)]
+        else:
+            linear = found[used[name] % len(found)]
+            used[name] += 1
+        out.append(Plan(name, linear, curved, s))
+    return out
+
+
+def starting_point(
+    model: Cascade, records: Sequence[Record], scaling: Scaling, plan: Plan
+) -> Values:
+    """Values of every site of a cascade, layer by layer along the mean trajectories.
+
+    The leading layer is the linear fit, other dynamic layers pass their input on with small random
+    dynamics beside it, and static layers start as the identity on the range of their input: the
+    cascade starts as the linear model, whose offset and noise it takes over.
+    """
+    generator = np.random.default_rng(plan.seed)
+    values: Values = {}
+    inputs = [scaled_inputs(scaling, record) for record in records]
+    driving = model.inputs - model.direct
+    signals = [{INPUTS: u[:, :driving]} for u in inputs]
+    if model.direct:
+        values["direct"] = _direct(model, plan)
+    targets = [scaled_outputs(scaling, record) for record in records]
+    if model.direct:
+        added = [u[:, driving:] @ values["direct"].mT for u in inputs]
+        targets = [y - a for y, a in zip(targets, added, strict=True)]
+    size = 1.0  # what signals below the leading layer were divided by
+    level = torch.zeros(model.outputs, dtype=torch.float64)
+    if plan.linear is not None:
+        level = level + plan.linear["offset"]
+    for one in model.wires:
+        seen = [see(s, one) for s in signals]
+        if isinstance(one.layer, Dynamic):
+            start = DynamicStart(model, one, one.layer, scaling, generator)
+            if one.name == plan.leading and plan.linear is not None:
+                values.update(start.from_linear(plan.linear))
+            else:
+                values.update(start.near_identity())
+            outputs = [start.response(values, r, x) for r, x in zip(records, seen, strict=True)]
+            factor = size
+            if not one.last:  # unit scale for the layer above
+                factor = 1.0 / max(float(torch.cat(outputs).std()), 1e-6)
+                size = size / factor
+            start.scale(values, factor)
+            outputs = [o * factor for o in outputs]
+        else:
+            assert isinstance(one.layer, Static)
+            line = (size, level) if one.last else None
+            curve = torch.cat(targets) if one.last and plan.curved else None
+            reach = torch.cat(targets) if one.last else None
+            outputs = start_static(model, one, one.layer, values, seen, line, curve, reach)
+        for signal, out in zip(signals, outputs, strict=True):
+            signal[one.name] = out
+    last = model.wires[-1].name
+    if isinstance(model.layers[-1], Dynamic):
+        values["offset"] = level
+    if plan.linear is not None and not plan.curved:
+        noise = plan.linear["noise_sd"].expand(model.outputs)
+    else:
+        errors = torch.cat([t - s[last] for t, s in zip(targets, signals, strict=True)])
+        noise = (0.7 * torch.nanmean(errors.square(), 0).sqrt() + 1e-3).clamp_max(1.0)
+    for index, record in enumerate(records):
+        suffix = "" if len(records) == 1 else f"_{index}"
+        for one in model.state_sites:
+            assert isinstance(one.layer, Dynamic)
+            state = torch.zeros(2 * one.layer.pairs, dtype=torch.float64)
+            if one.name == plan.leading and plan.linear is not None:
+                state = _linear_state(model, one, scaling, record, plan.linear)
+            values[f"{one.name}_initial_state{suffix}"] = state
+    if model.likelihood.varying:
+        values["log_noise_constant"] = (noise / TYPICAL).log()
+    else:
+        values["noise_sd"] = noise
+    _complete(model, scaling, values)
+    return {name: value.detach().clone() for name, value in values.items()}
+
+
+def _direct(model: Cascade, plan: Plan) -> Tensor:
+    """Weights of direct inputs as the linear fit has them, where it has all outputs."""
+    shape = (model.outputs, model.direct)
+    found = None if plan.linear is None else plan.linear.get("direct")
+    return torch.zeros(shape, dtype=torch.float64) if found is None else found.expand(shape)
+
+
+def _linear_state(
+    model: Cascade,
+    one: Wire,
+    scaling: Scaling,
+    record: Record,
+    linear: Mapping[str, Tensor],
+) -> Tensor:
+    """Standard normal numbers (2P,) of the first state that the linear fit finds by smoothing."""
+    layer = one.layer
+    assert isinstance(layer, Dynamic)
+    if layer.outputs != model.outputs:
+        return torch.zeros(2 * layer.pairs, dtype=torch.float64)
+    twin = Cascade(
+        model.inputs, (layer,), direct=model.direct, initial_state="integrated", scaling=scaling
+    )
+    with torch.no_grad(), pyro.poutine.block():
+        system = pyro.poutine.condition(twin.sample_system, data=dict(linear))(scaling)
+        assembly = assemble(system, time_grid(record.time), scaled_inputs(scaling, record))
+        problem = assembly.with_outputs(scaled_outputs(scaling, record))
+        elements, _ = problem.elements()
+        _, means, covariances, _, _ = filtering.run(problem.layout, elements[0])
+        rows = np.zeros((0, problem.G.shape[-1]))
+        first = smoothing.smooth(problem.layout, elements[0], rows, means, covariances)[0][0]
+        dynamic = system.layers[0]
+        assert isinstance(dynamic, DynamicSystem)
+        past, whole = dynamic.past_inputs, dynamic.prior_state().covariance
+        assert whole is not None
+        J = len(past)
+        eye = torch.eye(J, dtype=torch.float64)
+        ridge = 1e-9 * whole.diagonal().mean() * eye
+        left = past @ torch.linalg.solve(whole + ridge, torch.tensor(first[:J]))
+        root = torch.linalg.cholesky(past + 1e-9 * past.diagonal().mean() * eye)
+        state = torch.linalg.solve_triangular(root, left.unsqueeze(-1), upper=False).squeeze(-1)
+    return state.clamp(-3.0, 3.0)
+
+
+def _middle(name: str, node: Mapping[str, Any]) -> Tensor:
+    """A typical value of a site: zero for standard normal ones, the mean of normal ones."""
+    fn = node["fn"]
+    base = fn.base_dist if hasattr(fn, "base_dist") else fn
+    if isinstance(base, torch.distributions.LogNormal):
+        return base.loc.exp().expand(node["value"].shape).clone()
+    if isinstance(base, torch.distributions.Normal):
+        return base.mean.expand(node["value"].shape).clone()
+    return node["value"].detach().clone()
+
+
+def _complete(model: Cascade, scaling: Scaling, values: Values) -> None:
+    """Typical values for sites that no layer's start knows (hyperparameters of other kernels)."""
+    with pyro.poutine.block(), torch.no_grad():
+        trace = pyro.poutine.trace(
+            pyro.poutine.condition(model.sample_system, data=values)
+        ).get_trace(scaling)
+    for name, node in trace.nodes.items():
+        if node["type"] == "sample" and name not in values and not node["is_observed"]:
+            values[name] = _middle(name, node)

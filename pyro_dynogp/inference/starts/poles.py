@@ -1,0 +1,168 @@
+"""Starting points: poles at random, everything else by linear least squares given the poles."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.scaling import Scaling
+from pyro_dynogp.lti.grid import time_grid
+from pyro_dynogp.lti.modes import Modes
+from pyro_dynogp.lti.response import held_states
+from pyro_dynogp.models.linear import LinearDynamicGP
+from pyro_dynogp.models.priors import HORSESHOE_SCALE, TimeScale, numerators
+
+# What is left of new rows of a site, by the end of its name, where they shall do nothing yet. Not
+# nothing of process noise: of a gain that is zero the density has no slope.
+SILENT = {"input_gain": 0.0, "feedthrough": 0.0, "direct": 0.0, "initial_state": 0.0,
+          "noise_gain_unit": 0.05}  # fmt: skip
+
+
+def starting_values(
+    model: LinearDynamicGP, records: Sequence[Record], *, count: int, seed: int, tries: int = 48
+) -> list[dict[str, Tensor]]:
+    """Values of every site for the `count` best of `tries` random sets of poles.
+
+    Given the poles, the simulated output is linear in the residues c_j B_j, the feedthrough and
+    the offset: ridge regression gives them, and its residual ranks the sets.
+
+    Args:
+        model: with its scaling. records: the training records.
+        count: how many starts to return, best first. seed: of the random poles.
+        tries: sets of poles to look at; fewer for very long records.
+    """
+    scaling = model.scaling or Scaling.from_records(records)
+    generator = np.random.default_rng(seed)
+    total = sum(len(record) for record in records)
+    tries = max(count, min(tries, int(2e6 / total)))
+    candidates = []
+    for _ in range(tries):
+        poles = random_poles(model.pairs, scaling, generator)
+        candidates.append(values_given_poles(model, records, scaling, poles))
+    candidates.sort(key=lambda candidate: candidate[0])
+    return [values for _, values in candidates[:count]]
+
+
+def grown(
+    values: Mapping[str, Tensor], start: Mapping[str, Tensor], *, silent: bool = False
+) -> dict[str, Tensor]:
+    """A start with what another fit has learnt: values of a smaller model, or of the same one.
+
+    Sites of one name and as many dimensions share their first rows and columns; the rest of the
+    start (new inputs, pairs, layers) stays as it is. With `silent` the rest of a shared site does
+    nothing yet, so that the start explains nearly as much as what it has grown from.
+    """
+    out = {}
+    for name, value in start.items():
+        new = value.clone()
+        if name in values and values[name].dim() == new.dim():
+            if silent:
+                new *= next((x for end, x in SILENT.items() if name.endswith(end)), 1.0)
+            common = tuple(
+                slice(min(a, b)) for a, b in zip(new.shape, values[name].shape, strict=True)
+            )
+            new[common] = values[name][common]
+        out[name] = new
+    return out
+
+
+def random_poles(pairs: int, scaling: Scaling, generator: np.random.Generator) -> np.ndarray:
+    """Poles (P,) with log-uniform natural frequency and uniform damping ratio, slowest first."""
+    low, high = TimeScale.of(scaling).rate_bounds
+    # Not right at the limits: nothing can be learnt there and gradients vanish.
+    rate = np.exp(np.sort(generator.uniform(low + 1.0, high - 0.7, pairs)))
+    damping = generator.uniform(0.1, 0.95, pairs)
+    return rate * (-damping + 1j * np.sqrt(1.0 - damping**2))
+
+
+def values_given_poles(
+    model: LinearDynamicGP, records: Sequence[Record], scaling: Scaling, poles: np.ndarray
+) -> tuple[float, dict[str, Tensor]]:
+    """Mean squared residual, and values of every site, for poles (P,) [1/time unit]."""
+    P, n_u, n_y = model.pairs, model.inputs - model.direct, model.outputs
+    designs, targets = [], []
+    for record in records:
+        u = (record.inputs - scaling.input_offset) / scaling.input_scale
+        dynamic = _design(poles, record.time, u[:, :n_u], model.feedthrough)
+        designs.append(np.concatenate([u[:, n_u:], dynamic], axis=1))
+        targets.append((record.outputs - scaling.output_offset) / scaling.output_scale)
+    X, Y = np.concatenate(designs), np.concatenate(targets)
+    weights = np.stack([_ridge(X, Y[:, a]) for a in range(n_y)])  # n_y, columns
+    residual = Y - X @ weights.T
+    direct, weights = weights[:, : model.direct], weights[:, model.direct :]
+    spread = np.nanstd(residual, axis=0)
+    rate = np.abs(poles)
+    gains = weights[:, : 2 * P * n_u].reshape(n_y, P, n_u, 2)
+    residues = (gains[..., 0] + 1j * gains[..., 1]) * rate[:, None]  # c_aj B_jm
+    unit_rate = TimeScale.of(scaling).typical_rate
+    values: dict[str, Any] = {
+        "g_log_decay": np.log(-poles.real / unit_rate),
+        "g_log_frequency": np.log(poles.imag / unit_rate),
+        "offset": weights[:, -1],
+        "noise_sd": 0.7 * spread + 1e-3,
+    }
+    if model.direct:
+        values["direct"] = direct
+    direction = np.ones((n_y, P), dtype=complex)
+    B = residues[0]
+    if model.several_outputs:
+        # The best single direction for each pair: first singular vectors of its residues.
+        B = np.zeros((P, n_u), dtype=complex)
+        for j in range(P):
+            if n_u:
+                left, size, right = np.linalg.svd(residues[:, j, :], full_matrices=False)
+                turn = np.exp(-1j * np.angle(left[0, 0]))
+                direction[:, j], B[j] = left[:, 0] * turn, size[0] * right[0] / turn
+        values["g_output_gain"] = np.stack([direction.real, direction.imag], -1)
+    if n_u:
+        # From residues to sections: b1 = g1 |lambda|, b0 = g0 |lambda|^2.
+        section = numerators(torch.as_tensor(poles), torch.as_tensor(B)).numpy()
+        section = section / np.stack([rate, rate**2], -1)[:, None, :]
+        values["g_input_gain"] = np.clip(section, -10.0, 10.0)
+        if model.feedthrough:
+            D = weights[:, 2 * P * n_u : -1]
+            values["g_feedthrough"] = D if model.several_outputs else D[0]
+    if model.process_noise:
+        brownian = model.brownian or n_y
+        share = 0.3 * float(spread.mean()) / math.sqrt(P * brownian)
+        values["g_noise_gain_local_scale"] = np.full(P, math.sqrt(share / HORSESHOE_SCALE))
+        unit = np.full((P, brownian, 2), math.sqrt(0.5 * share / HORSESHOE_SCALE))
+        values["g_noise_gain_unit"] = unit
+    if model.initial_state == "site":
+        suffixes = [""] if len(records) == 1 else [f"_{i}" for i in range(len(records))]
+        for suffix in suffixes:
+            values[f"initial_state{suffix}"] = np.zeros(2 * P)
+    tensors = {name: torch.tensor(value, dtype=torch.float64) for name, value in values.items()}
+    return float(np.nanmean(residual**2)), tensors
+
+
+def _design(poles: np.ndarray, time: np.ndarray, u: np.ndarray, feedthrough: bool) -> np.ndarray:
+    """Regressors (n, 2 P n_u + n_u + 1): y = 2 Re sum B/|lambda| x + D u + offset."""
+    n, n_u = u.shape
+    grid = time_grid(time)
+    columns = []
+    if n_u:
+        one = torch.ones(len(poles), dtype=torch.complex128)
+        modes = Modes(torch.as_tensor(poles), one.unsqueeze(-1), one)
+        states = np.stack(
+            [held_states(modes, grid, u[:, m : m + 1]) for m in range(n_u)], -1
+        )  # n, P, n_u
+        states = 2.0 * states * np.abs(poles)[:, None]
+        columns.append(np.stack([states.real, -states.imag], -1).reshape(n, -1))
+        if feedthrough:
+            columns.append(u)
+    columns.append(np.ones((n, 1)))
+    return np.concatenate(columns, axis=1)
+
+
+def _ridge(X: np.ndarray, y: np.ndarray, strength: float = 1e-4) -> np.ndarray:
+    there = np.isfinite(y)
+    A = X[there].T @ X[there]
+    scale = np.trace(A) / len(A)
+    return np.linalg.solve(A + strength * scale * np.eye(len(A)), X[there].T @ y[there])

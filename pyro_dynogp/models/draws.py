@@ -1,0 +1,287 @@
+"""Trajectories of all layers drawn forwards, from inputs and a first state."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pyro_dynogp.distributions.process import LTIProcess
+from pyro_dynogp.lti.grid import TimeGrid, time_grid
+from pyro_dynogp.lti.modes import Modes
+from pyro_dynogp.lti.response import mean_response
+from pyro_dynogp.lti.state import ModalState
+from pyro_dynogp.models.model import support_points
+from pyro_dynogp.models.system import CascadeSystem, DynamicSystem, StaticSystem, see
+from pyro_dynogp.models.wiring import INPUTS, Static
+
+
+@dataclass(frozen=True, eq=False)
+class JointState:
+    """Gaussian state of all dynamic layers at one time, real parts of all before imaginary ones.
+
+    Attributes:
+        mean: (*b, N). covariance: (*b, N, N).
+    """
+
+    mean: Tensor
+    covariance: Tensor
+
+    def root(self) -> Tensor:
+        """Square root (*b, N, N) of the covariance, singular or not."""
+        values, vectors = torch.linalg.eigh(self.covariance)
+        return vectors * values.clamp_min(0.0).sqrt().unsqueeze(-2)
+
+
+@dataclass(frozen=True, eq=False)
+class Randomness:
+    """Standard normal numbers behind one set of draws: with the same ones, two draws compare.
+
+    Attributes:
+        state: (*shape, N). innovations: (*shape, n) or (*shape, n, w) for each dynamic layer.
+        residual: (*shape, e, K) for each static layer.
+    """
+
+    state: Tensor
+    innovations: Mapping[str, Tensor]
+    residual: Mapping[str, Tensor]
+
+    @classmethod
+    def draw(cls, system: CascadeSystem, n: int, shape: torch.Size) -> Randomness:
+        """From torch's generator."""
+        states = 0
+        innovations, residual = {}, {}
+        for one, layer in zip(system.wires, system.layers, strict=True):
+            if isinstance(layer, DynamicSystem):
+                states += 2 * layer.modes.pairs
+                event = (n, layer.modes.outputs) if layer.modes.several_outputs else (n,)
+                innovations[one.name] = torch.randn(*shape, *event, dtype=torch.float64)
+            else:
+                assert isinstance(one.layer, Static)
+                event = (one.layer.outputs, one.layer.support)
+                residual[one.name] = torch.randn(*shape, *event, dtype=torch.float64)
+        return cls(torch.randn(*shape, states, dtype=torch.float64), innovations, residual)
+
+    @property
+    def first(self) -> Randomness:
+        """The first numbers of each posterior draw: enough where none of them is used."""
+        return Randomness(
+            self.state[:1],
+            {name: x[:1] for name, x in self.innovations.items()},
+            {name: x[:1] for name, x in self.residual.items()},
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Switches:
+    """Which causes of uncertainty act in a draw.
+
+    Attributes:
+        initial_state: whether the first state is drawn, or at its mean.
+        process_noise: names of the dynamic layers whose process noise acts.
+        functions: whether static functions below a dynamic layer are drawn, or at their mean.
+        several_channels: whether those of several channels are, too. The moment-matching filter
+            has them at their mean given the inducing values, since a few inducing points leave
+            much of a space of several channels open; so must what is predicted from such a fit.
+    """
+
+    initial_state: bool
+    process_noise: frozenset[str]
+    functions: bool
+    several_channels: bool = False
+
+    @property
+    def any(self) -> bool:
+        """Whether any cause acts: else equal parameters give equal draws."""
+        return self.initial_state or bool(self.process_noise) or self.functions
+
+    @classmethod
+    def all_on(
+        cls, system: CascadeSystem, process_noise: bool = True, several_channels: bool = False
+    ) -> Switches:
+        """Everything acts; process noise and functions of several channels only if asked for."""
+        names = {
+            one.name
+            for one, layer in zip(system.wires, system.layers, strict=True)
+            if isinstance(layer, DynamicSystem) and layer.modes.has_process_noise
+        }
+        return cls(True, frozenset(names if process_noise else ()), True, several_channels)
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """Draws of all layers (scaled).
+
+    Attributes:
+        signals: (*shape, n, w) by layer; of a last static layer its mean given its input.
+        mean: (*shape, n, n_y) of the noise-free output given everything drawn below the last layer.
+        variance: (*shape, n, n_y) of the last layer itself: process noise or the static function.
+    """
+
+    signals: Mapping[str, Tensor]
+    mean: Tensor
+    variance: Tensor
+
+
+def draw_layers(
+    system: CascadeSystem,
+    grid: TimeGrid,
+    inputs: Tensor,
+    start: JointState,
+    random: Randomness,
+    switches: Switches,
+) -> Drawn:
+    """Draw every layer's trajectory, first to last.
+
+    Args:
+        system: the layers, batch shape *b. grid: time axis. inputs: (n, n_u) scaled.
+        start: state at the first sample. random: numbers of shape (*shape, ...), which *b
+            broadcasts to. switches: which causes act.
+    """
+    state = start.mean
+    if switches.initial_state:
+        state = state + (start.root() @ random.state.unsqueeze(-1)).squeeze(-1)
+    lead = random.state.shape[:-1]
+    state = state.expand((*lead, state.shape[-1]))
+    half = state.shape[-1] // 2
+    driving = system.driving(inputs)
+    signals: dict[str, Tensor] = {INPUTS: driving.expand(lead + driving.shape[-2:])}
+    before = 0
+    mean = signals[INPUTS]
+    variance = torch.zeros(())
+    for one, layer in zip(system.wires, system.layers, strict=True):
+        x = see(signals, one)
+        if isinstance(layer, DynamicSystem):
+            modes = layer.modes
+            own = slice(before, before + modes.pairs)
+            other = slice(half + before, half + before + modes.pairs)
+            x0 = torch.complex(state[..., own], state[..., other])
+            before += modes.pairs
+            driven = x if modes.inputs else None
+            value = mean_response(modes, grid, driven, x0).output
+            mean, variance = value, torch.zeros_like(value)
+            if one.name in switches.process_noise:
+                noise = fresh_noise(modes, grid)
+                value = value + noise.from_innovations(random.innovations[one.name])
+                variance = noise.variance.expand(value.shape)
+            if not modes.several_outputs:
+                value, mean, variance = (v.unsqueeze(-1) for v in (value, mean, variance))
+        else:
+            value, mean, variance = _static(
+                one.layer, layer, x, random.residual[one.name], switches
+            )
+            if one.last:
+                value = mean
+        signals[one.name] = value
+    level = system.level(inputs)
+    if level is not None:
+        mean = mean + level
+    return Drawn(signals, mean, variance.expand(mean.shape))
+
+
+def _static(
+    spec: Any, layer: StaticSystem, x: Tensor, residual: Tensor, switches: Switches
+) -> tuple[Tensor, Tensor, Tensor]:
+    """One function along x, or its mean; mean and variance at each point."""
+    function = layer.function
+    support = support_points(function.locations, spec.support)
+    if function.channels > 1:
+
+        def at(part: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            if not (switches.functions and switches.several_channels):
+                mean = function.mean(part)
+                return mean, mean, torch.zeros_like(mean)
+            mean, variance = function.moments(part)
+            return function.path(part, residual, support), mean, variance
+
+        # Stretch by stretch: kernel matrices of all points at once would not fit.
+        points = x.shape[:-2].numel() * (function.locations.shape[-2] + support.shape[-2])
+        stretches = x.split(max(1, KERNEL_ENTRIES // points), -2)
+        value, mean, variance = (
+            torch.cat(part, -2) for part in zip(*map(at, stretches), strict=True)
+        )
+        return value, mean, variance
+    # Functions of one channel are read off a fine grid: far fewer kernel evaluations.
+    batch = function.batch_shape
+    over = tuple(range(x.dim() - 2 - len(batch)))
+    low, high = (x.amin(over), x.amax(over)) if over else (x, x)
+    low, high = low.amin(-2).squeeze(-1), high.amax(-2).squeeze(-1) + 1e-9
+    share = torch.linspace(0.0, 1.0, FINE, dtype=torch.float64)
+    grid = (low.unsqueeze(-1) + (high - low).unsqueeze(-1) * share).unsqueeze(-1)
+    place = (x.squeeze(-1) - low.unsqueeze(-1)) / (high - low).unsqueeze(-1) * (FINE - 1)
+    on_mean, on_variance = function.moments(grid)
+    mean = _read(on_mean, place)
+    if not switches.functions:
+        return mean, mean, torch.zeros_like(mean)
+    return (
+        _read(function.path(grid, residual, support), place),
+        mean,
+        _read(on_variance, place).clamp_min(0.0),
+    )
+
+
+# Most entries of a kernel matrix along a trajectory (32 MB).
+KERNEL_ENTRIES = 4_000_000
+# Points of the grid that a function of one channel is read off.
+FINE = 1025
+
+
+def _read(values: Tensor, place: Tensor) -> Tensor:
+    """Linear interpolation of values (*b, FINE, e) at places (*s, n): (*s, n, e)."""
+    first = place.floor().clamp(0, FINE - 2).long()
+    part = (place - first).unsqueeze(-1)
+    full = values.expand((*first.shape[:-1], *values.shape[-2:]))
+    index = first.unsqueeze(-1).expand((*first.shape, values.shape[-1]))
+    return torch.gather(full, -2, index) * (1 - part) + torch.gather(full, -2, index + 1) * part
+
+
+def fresh_noise(modes: Modes, grid: TimeGrid) -> LTIProcess:
+    """What process noise adds to the output from a known first state on."""
+    P = modes.pairs
+    alone = Modes(
+        poles=modes.poles,
+        output_gain=modes.output_gain,
+        noise_gain=modes.noise_gain,
+        noise=modes.noise,
+    )
+    known = ModalState(
+        torch.zeros_like(modes.poles), torch.zeros(2 * P, 2 * P, dtype=torch.float64)
+    )
+    return LTIProcess(alone, grid, None, known)
+
+
+def known_start(system: CascadeSystem) -> Tensor:
+    """State (*b, N) that past inputs are known to have left at the first sample, else zero."""
+    parts = []
+    for layer in system.layers:
+        if isinstance(layer, DynamicSystem):
+            x = layer.first_state
+            x = torch.zeros_like(layer.modes.poles) if x is None else x
+            parts.append(x.expand((*system.batch_shape, layer.modes.pairs)))
+    if not parts:
+        return torch.zeros(0, dtype=torch.float64)
+    joined = torch.cat(parts, -1)
+    return torch.cat([joined.real, joined.imag], -1)
+
+
+def draw_outputs(system: CascadeSystem, time: Any, inputs: Tensor, shape: torch.Size) -> Tensor:
+    """Noisy scaled outputs (*shape, n, n_y) from inputs alone; shape ends in the batch shape."""
+    from pyro_dynogp.models.assembly import assemble
+
+    grid = time_grid(time)
+    problem = assemble(system, grid, inputs).problem
+    start = JointState(known_start(system), problem.P0)
+    random = Randomness.draw(system, len(grid), shape)
+    on = Switches.all_on(system, several_channels=True)  # the model as it is stated
+    drawn = draw_layers(system, grid, inputs, start, random, on)
+    signal = drawn.signals[system.wires[-1].name]
+    if isinstance(system.layers[-1], DynamicSystem):
+        level = system.level(inputs)
+        signal = signal if level is None else signal + level
+    else:
+        signal = drawn.mean + drawn.variance.sqrt() * torch.randn_like(drawn.mean)
+    noise = system.noise.distribution(signal, system.noise_sd(inputs, grid), None)
+    return noise.sample()

@@ -1,0 +1,198 @@
+"""The layers of a cascade given their parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.scaling import Scaling
+from pyro_dynogp.layers.functions import StaticFunction
+from pyro_dynogp.layers.noise import Noise
+from pyro_dynogp.lti.covariance import state_covariance
+from pyro_dynogp.lti.grid import time_grid
+from pyro_dynogp.lti.modes import Modes
+from pyro_dynogp.lti.response import mean_response
+from pyro_dynogp.lti.state import ModalState
+from pyro_dynogp.models.linear import initial_mean
+from pyro_dynogp.models.wiring import INPUTS, Wire
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.tensors import as_tensor, broadcast
+
+
+@dataclass(frozen=True, eq=False)
+class DynamicSystem:
+    """A dynamic layer given its parameters: scaled inputs to scaled outputs, time in record units.
+
+    Attributes:
+        modes: poles and gains.
+        past_inputs: (*b, 2P, 2P) covariance that unknown past inputs give the first state.
+        first_state: (*b, P) complex, what past inputs left at the first sample of the record at
+            hand; None where it is not known.
+    """
+
+    modes: Modes
+    past_inputs: Tensor
+    first_state: Tensor | None = None
+
+    def prior_state(self, process_noise: bool = True) -> ModalState:
+        """Gaussian state at the first sample: what past inputs left, and past process noise."""
+        modes = self.modes if process_noise else self.modes.without_process_noise()
+        covariance = state_covariance(modes)
+        if self.first_state is not None:
+            return ModalState(self.first_state, covariance)
+        return ModalState(torch.zeros_like(modes.poles), covariance + self.past_inputs)
+
+    def mean(self, x: Tensor, time: Any) -> Tensor:
+        """Output (*b, n, w) that x (*b, n, d) alone causes, from the known first state or rest."""
+        driven = x if self.modes.inputs else None
+        value = mean_response(self.modes, time, driven, self.first_state).output
+        return value if self.modes.several_outputs else value.unsqueeze(-1)
+
+    def after(self, standard: Tensor) -> DynamicSystem:
+        """The system after past inputs that standard normal numbers (*b, 2P) describe."""
+        return replace(self, first_state=initial_mean(self.past_inputs, standard))
+
+
+@dataclass(frozen=True, eq=False)
+class StaticSystem:
+    """A static layer given its parameters.
+
+    Attributes:
+        function: the Gaussian process given its inducing values.
+        support: (*b, K, d), residual: (*b, e, K): innovations of the rest of the function, drawn
+            where the layer feeds a dynamic one and is not integrated out; else None.
+    """
+
+    function: StaticFunction
+    support: Tensor | None = None
+    residual: Tensor | None = None
+
+    def mean(self, x: Tensor, time: Any) -> Tensor:
+        """Mean of the function along x (*b, n, d): (*b, n, e), at whatever times."""
+        return self.function.mean(x)
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """One function along x (*b, n, d): (*b, n, e)."""
+        if self.residual is None or self.support is None:
+            return self.function.mean(x)
+        return self.function.path(x, self.residual, self.support)
+
+
+@dataclass(frozen=True, eq=False)
+class CascadeSystem:
+    """All layers given their parameters, in units of the scaled record.
+
+    Attributes:
+        wires: how they are connected. layers: a system for each wire.
+        noise: measurement noise. offset: (*b, n_y), or None where a static layer comes last.
+        direct: (*b, n_y, K) weights of the last K inputs, which act on the output at once.
+    """
+
+    wires: tuple[Wire, ...]
+    layers: tuple[DynamicSystem | StaticSystem, ...]
+    noise: Noise
+    offset: Tensor | None
+    direct: Tensor | None = None
+
+    @cached_property
+    def batch_shape(self) -> torch.Size:
+        """The common batch shape of all parameters and known first states."""
+        shapes = [self.noise.batch_shape]
+        if self.offset is not None:
+            shapes.append(self.offset.shape[:-1])
+        if self.direct is not None:
+            shapes.append(self.direct.shape[:-2])
+        for layer in self.layers:
+            if isinstance(layer, DynamicSystem):
+                shapes.append(layer.modes.batch_shape)
+                if layer.first_state is not None:
+                    shapes.append(layer.first_state.shape[:-1])
+            else:
+                shapes.append(layer.function.batch_shape)
+        return broadcast(*shapes)
+
+    def driving(self, inputs: Tensor) -> Tensor:
+        """What the layers see of scaled inputs (*b, n, n_u): all but those that act at once."""
+        return inputs if self.direct is None else inputs[..., : -self.direct.shape[-1]]
+
+    def level(self, inputs: Tensor) -> Tensor | None:
+        """What is added to the last layer's output: offset and direct inputs (*b, n or 1, n_y)."""
+        level = None if self.offset is None else self.offset.unsqueeze(-2)
+        if self.direct is None:
+            return level
+        direct = inputs[..., -self.direct.shape[-1] :] @ self.direct.mT
+        return direct if level is None else level + direct
+
+    def undisturbed(self, inputs: Tensor, time: Any) -> Tensor:
+        """Output (*b, n, n_y) that inputs (*b, n, n_u) alone cause, static layers at their mean.
+
+        Dynamic layers start from the first state that is known of them, else at rest.
+        """
+        grid, signals = time_grid(time), {INPUTS: self.driving(inputs)}
+        for one, layer in zip(self.wires, self.layers, strict=True):
+            signals[one.name] = layer.mean(see(signals, one), grid)
+        output = signals[self.wires[-1].name]
+        level = self.level(inputs)
+        return output if level is None else output + level
+
+    def noise_sd(self, inputs: Tensor, time: Any) -> Tensor:
+        """Scale (*b, n, n_y) of the measurement noise along scaled inputs (*b, n, n_u).
+
+        Args:
+            inputs: scaled. time: (n,) their times in the record's unit, or a `TimeGrid`.
+        """
+        likelihood = self.noise.likelihood
+        if likelihood.varying and likelihood.of == "output":
+            return self.noise.sd(self.undisturbed(inputs, time))
+        return self.noise.sd(self.driving(inputs))
+
+    def after(self, states: Mapping[str, Tensor]) -> CascadeSystem:
+        """The cascade after past inputs, given by standard normal numbers (*b, 2P) by layer."""
+        layers = tuple(
+            layer.after(states[one.name])
+            if isinstance(layer, DynamicSystem) and one.name in states
+            else layer
+            for one, layer in zip(self.wires, self.layers, strict=True)
+        )
+        return replace(self, layers=layers)
+
+    def layer(self, name: str) -> DynamicSystem | StaticSystem:
+        """The system of a layer by name.
+
+        Raises:
+            ValueError: where there is no such layer.
+        """
+        for one, system in zip(self.wires, self.layers, strict=True):
+            if one.name == name:
+                return system
+        names = [one.name for one in self.wires]
+        raise invalid("name", expected=f"one of the layers {names}", got=repr(name))
+
+
+def see(signals: dict[str, Tensor], one: Wire) -> Tensor:
+    """What a layer sees (*b, n, channels): its sources side by side."""
+    parts = [signals[name] for name in one.sources]
+    if len(parts) == 1:
+        return parts[0]
+    batch = broadcast(*(p.shape[:-2] for p in parts))
+    return torch.cat([p.expand(batch + p.shape[-2:]) for p in parts], -1)
+
+
+def scaled_inputs(scaling: Scaling, record: Record, inputs: Tensor | None = None) -> Tensor:
+    """Inputs (*b, n, n_u), by default a record's, in standard deviations of the training record."""
+    u = record.tensors().inputs if inputs is None else inputs
+    if not u.shape[-1]:
+        return u
+    return (u - as_tensor(scaling.input_offset)) / as_tensor(scaling.input_scale)
+
+
+def scaled_outputs(scaling: Scaling, record: Record) -> Tensor:
+    """Outputs (n, n_y) of a record, in standard deviations of the training record."""
+    y = record.tensors().outputs
+    return (y - as_tensor(scaling.output_offset)) / as_tensor(scaling.output_scale)

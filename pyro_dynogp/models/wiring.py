@@ -1,0 +1,213 @@
+"""What a cascade is made of: dynamic and static layers, and how they are wired."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+from pyro_dynogp.lti.modes import NoiseStructure
+from pyro_dynogp.support.errors import invalid
+
+INPUTS = "inputs"
+# Lowest and highest value, None where there is none.
+Limits = tuple[float | None, float | None]
+
+
+@dataclass(frozen=True)
+class Dynamic:
+    """A stochastic LTI layer: its output is the trajectory of a linear system with process noise.
+
+    Args:
+        outputs: width of the layer. pairs: P conjugate pairs (order 2P), shared by all outputs.
+        noise: "shared" or "independent" Brownian motions, see `Modes`.
+        brownian: number of Brownian motions; by default one for each output.
+        feedthrough: whether the layer's input acts on its output at once.
+        process_noise: whether there is any.
+        skip: names of earlier signals ("inputs", or layers) that the layer sees beside the
+            output of the layer before it.
+        name: prefix of its sites; g, or g1, g2, ... by default.
+    """
+
+    outputs: int = 1
+    pairs: int = 5
+    noise: NoiseStructure = "shared"
+    brownian: int | None = None
+    feedthrough: bool = True
+    process_noise: bool = True
+    skip: tuple[str, ...] = ()
+    name: str | None = None
+
+
+@dataclass(frozen=True)
+class Static:
+    """A static layer: a Gaussian process of the signals below, with inducing values.
+
+    Args:
+        outputs: width of the layer. inducing: number of inducing values for each output.
+        kernel: a gpytorch kernel; Matern-3/2 with a lengthscale for each channel by default.
+        mean: "linear" or "constant" prior mean; by default linear for a first layer and where
+            there are limits, else constant. Beyond the data a function goes back to it.
+        limits: lowest and highest value of the linear mean [output], None for none: those of a
+            sensor that stops. Of a last layer of one signal and one output.
+        skip: names of earlier signals that the layer sees too.
+        learn_locations: whether the inducing locations are learnt.
+        support: number of points at which the residual of the function given its inducing values
+            is drawn, where the layer feeds a dynamic one and is not integrated out.
+        name: prefix of its sites; f, or f1, f2, ... by default.
+    """
+
+    outputs: int = 1
+    inducing: int = 32
+    kernel: Any = None
+    mean: Literal["constant", "linear"] | None = None
+    limits: Limits | None = None
+    skip: tuple[str, ...] = ()
+    learn_locations: bool = True
+    support: int = 64
+    name: str | None = None
+
+
+Layer = Dynamic | Static
+
+
+@dataclass(frozen=True)
+class Wire:
+    """One layer in its place.
+
+    Attributes:
+        name: of the layer. layer: its specification, nothing left to default.
+        sources: names of the signals it sees, in order. channels: how many they are.
+        pathwise: whether a dynamic layer sees its output, directly or through static layers.
+        last: whether it is the last.
+    """
+
+    name: str
+    layer: Layer
+    sources: tuple[str, ...]
+    channels: int
+    pathwise: bool
+    last: bool
+
+    @property
+    def described(self) -> str:
+        """What to call the layer in a sentence."""
+        kind = "dynamic" if isinstance(self.layer, Dynamic) else "static"
+        return f"{kind} layer {self.name}"
+
+
+def wire(inputs: int, layers: Sequence[Layer]) -> tuple[Wire, ...]:
+    """Name the layers, count their channels and say what each feeds.
+
+    Raises:
+        ValueError: for no layers, names that repeat, skips that point nowhere or forward.
+    """
+    if not layers:
+        raise invalid("layers", expected="at least one layer", got="none")
+    names = _names(layers)
+    width = {INPUTS: inputs}
+    wires: list[Wire] = []
+    before: str = INPUTS
+    for place, (name, layer) in enumerate(zip(names, layers, strict=True)):
+        _check_layer(name, layer)
+        for skipped in layer.skip:
+            if skipped not in width or skipped == before:
+                raise invalid(
+                    f"skip of layer {name!r}",
+                    expected=f"names of earlier signals, {sorted(set(width) - {before})}",
+                    got=repr(skipped),
+                )
+        sources = (before, *layer.skip)
+        channels = sum(width[s] for s in sources)
+        if isinstance(layer, Static):
+            if channels == 0:
+                raise invalid(
+                    f"layer {name!r}", expected="inputs for a static layer", got="no channels"
+                )
+            linear = place == 0 or layer.limits is not None
+            layer = replace(layer, mean=layer.mean or ("linear" if linear else "constant"))
+            if layer.limits is not None:
+                _check_limits(name, layer, channels, place == len(layers) - 1)
+        elif channels == 0 and not layer.process_noise:
+            raise invalid(
+                f"process_noise of layer {name!r}",
+                expected="True for a layer without inputs",
+                got="False",
+            )
+        last = place == len(layers) - 1
+        wires.append(Wire(name, layer, sources, channels, False, last))
+        width[name] = layer.outputs
+        before = name
+    feeds: set[str] = set()
+    for place in range(len(wires) - 1, -1, -1):
+        here = wires[place]
+        pathwise = here.name in feeds
+        wires[place] = replace(here, pathwise=pathwise)
+        if isinstance(here.layer, Dynamic) or pathwise:
+            feeds.update(here.sources)
+    return tuple(wires)
+
+
+def _names(layers: Sequence[Layer]) -> list[str]:
+    letters = {Dynamic: "g", Static: "f"}
+    kinds: list[type] = []
+    for layer in layers:
+        if not isinstance(layer, Dynamic | Static):
+            raise invalid("layers", expected="Dynamic and Static layers", got=repr(layer))
+        kinds.append(type(layer))
+    names = []
+    for place, (kind, layer) in enumerate(zip(kinds, layers, strict=True)):
+        number = "" if kinds.count(kind) == 1 else str(kinds[: place + 1].count(kind))
+        names.append(layer.name or letters[kind] + number)
+    reserved = {INPUTS, "y", "offset", "noise_sd", "log_noise"}
+    if len(set(names)) < len(names) or set(names) & reserved:
+        raise invalid(
+            "layers",
+            expected=f"a name of its own for each layer, none of {sorted(reserved)}",
+            got=str(names),
+        )
+    return names
+
+
+def _check_layer(name: str, layer: Layer) -> None:
+    numbers = {"outputs": layer.outputs}
+    if isinstance(layer, Dynamic):
+        numbers["pairs"] = layer.pairs
+        if layer.noise not in ("shared", "independent"):
+            raise invalid(
+                f"noise of layer {name!r}",
+                expected="'shared' or 'independent'",
+                got=repr(layer.noise),
+            )
+    else:
+        numbers["inducing"] = layer.inducing
+        numbers["support"] = layer.support
+        if layer.mean not in (None, "constant", "linear"):
+            raise invalid(
+                f"mean of layer {name!r}",
+                expected="'constant' or 'linear'",
+                got=repr(layer.mean),
+            )
+    for argument, value in numbers.items():
+        if not isinstance(value, int) or value < 1:
+            raise invalid(
+                f"{argument} of layer {name!r}", expected="a whole number >= 1", got=repr(value)
+            )
+
+
+def _check_limits(name: str, layer: Static, channels: int, last: bool) -> None:
+    assert layer.limits is not None
+    known = [one for one in layer.limits if one is not None]
+    if len(layer.limits) != 2 or not known or known != sorted(set(known)):
+        raise invalid(
+            f"limits of layer {name!r}",
+            expected="(low, high) with low < high; None for one that is not there",
+            got=repr(layer.limits),
+        )
+    if not last or layer.mean != "linear" or (channels, layer.outputs) != (1, 1):
+        raise invalid(
+            f"limits of layer {name!r}",
+            expected="a last layer with a linear mean, of one signal and one output",
+            got=f"mean {layer.mean!r}, {channels} signals, {layer.outputs} outputs"
+            + ("" if last else ", not the last layer"),
+        )

@@ -1,0 +1,1 @@
+"""What a closed loop found, for a reader: sentences, figures, a page."""

@@ -1,0 +1,1 @@
+"""Tests of residuals: filters, bootstrap, regressions, omnibus test."""

@@ -1,0 +1,1 @@
+"""What every part of the package leans on: errors, tensors, compiled code, processes."""

@@ -1,0 +1,114 @@
+"""One way to run independent pieces of work: processes here, or a cluster where the user has one.
+
+Work goes through joblib. By default it runs in local processes; inside
+``joblib.parallel_config(backend="dask")`` (or "ray") it runs on that cluster.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import random
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeVar
+
+import joblib
+import numpy as np
+import torch
+from joblib.parallel import get_active_backend
+from threadpoolctl import threadpool_limits
+from tqdm import tqdm
+
+from pyro_dynogp.support.errors import invalid
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Inside, torch and the linear algebra of numpy and scipy run on one thread; also a decorator.
+
+    Matrices are small here: more threads gain nothing on an idle machine, wait for each other in
+    circles on a busy one, and let the order of a sum depend on how many processors there are.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1):
+            yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@contextlib.contextmanager
+def seeded(seed: int) -> Iterator[None]:
+    """Seed torch, numpy and random inside, on one thread; outside nothing has changed."""
+    states = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
+    torch.manual_seed(seed)
+    np.random.seed(seed % 2**32)  # noqa: NPY002 (Pyro and its guides draw from the global state)
+    random.seed(seed)
+    try:
+        with one_thread():
+            yield
+    finally:
+        torch.set_rng_state(states[0])
+        np.random.set_state(states[1])  # noqa: NPY002
+        random.setstate(states[2])
+
+
+def child_seeds(seed: int, count: int) -> list[int]:
+    """Independent seeds for `count` pieces of work, the same for the same seed."""
+    children = np.random.SeedSequence(seed).spawn(count)
+    return [int(child.generate_state(1, np.uint32)[0]) for child in children]
+
+
+def parallel_map(
+    function: Callable[[Item], Result],
+    items: Sequence[Item],
+    *,
+    workers: int | None = None,
+    progress: bool = False,
+    description: str = "",
+    news: Callable[[Sequence[Result]], str] | None = None,
+) -> list[Result]:
+    """Apply a function to every item; results in the order of the items.
+
+    Args:
+        function: importable or closure (it is sent to other processes).
+        items: arguments, one for each call.
+        workers: number of processes; 1 runs here, None uses every processor or the whole cluster.
+        progress: whether to show a bar, with the time left. description: its label.
+        news: what to write beside the bar, of the results so far.
+
+    Raises:
+        ValueError: where workers is not a positive whole number. Errors of the function are
+            raised here as they are.
+    """
+    if workers is not None and workers < 1:
+        raise invalid("workers", expected="a whole number >= 1, or None", got=repr(workers))
+    bar = tqdm(total=len(items), desc=description, disable=not progress)
+    results: list[Result] = []
+
+    def advance(result: Result) -> None:
+        results.append(result)
+        if news is not None:
+            bar.set_postfix_str(news(results), refresh=False)
+        bar.update()
+
+    with bar:
+        if workers == 1 or len(items) <= 1:
+            for item in items:
+                advance(_call(function, item))
+            return results
+        backend, _ = get_active_backend()
+        local = type(backend).__name__ == "LokyBackend"
+        count = min(len(items), workers or joblib.cpu_count()) if local else workers
+        pool = joblib.Parallel(n_jobs=count, return_as="generator" if local else "list")
+        for result in pool(joblib.delayed(_call)(function, item) for item in items):
+            advance(result)
+    return results
+
+
+@one_thread()
+def _call(function: Callable[[Any], Any], item: Any) -> Any:
+    return function(item)

@@ -1,0 +1,327 @@
+"""Which of the effects that help comes first, what they are scored on, which variants there are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import binom
+
+import pyro_dynogp as dgp
+from pyro_dynogp import effects
+from pyro_dynogp.data.channels import Calendar, Delayed, ShiftedClock
+from pyro_dynogp.discrepancy.blocks import shared
+from pyro_dynogp.discrepancy.decision import (
+    _first_in_line,
+    _judge,
+    _Judged,
+    _specific,
+    _too_special,
+    confirm,
+)
+from pyro_dynogp.discrepancy.search import Found
+from pyro_dynogp.discrepancy.trials import Tried, interleaved, stretches
+from pyro_dynogp.statistics.evidence import Evidence
+from tests.discrepancy.test_loop import fitted, machine
+
+MODEL = dgp.LinearDynamicGP(inputs=1, pairs=1)
+
+
+def spoken_for(effect: effects.Effect, p: float, q: float, **where: Any) -> Found:
+    evidence = Evidence(effect.name, 1.0, p, 1.0, 1.0, where, "It is so.", None)
+    return Found(effect, evidence, q)
+
+
+def tried(gains: np.ndarray, **options: Any) -> Tried:
+    return Tried(MODEL, gains, 0.0, **options)
+
+
+def helping(effect: effects.Effect, p: float, q: float, gain: float = 50.0) -> _Judged:
+    n = 100
+    kind = ("after", effect.score)
+    noise = np.random.default_rng(0).normal(0.0, 0.1, n)
+    found = spoken_for(effect, p, q)
+    return _judge(found, kind, tried(noise + gain / n), tried(np.zeros(n)), 1)
+
+
+def names(judged: list[_Judged]) -> list[str]:
+    return [one.found.effect.name for one in judged]
+
+
+def test_structure_comes_before_noise() -> None:
+    both = [helping(effects.HeavyTails(), 1e-9, 1e-8), helping(effects.Drift(), 1e-3, 1e-2)]
+    assert names(_first_in_line(both, 0.05)) == ["drift"]
+
+
+def test_only_relatives_stand_beside_a_certain_cause() -> None:
+    step, lucky = helping(effects.LevelShift(), 1e-9, 1e-8), helping(effects.ExtraInput(), 0.2, 1.0)
+    assert names(_first_in_line([lucky, step], 0.05)) == ["level shift"]
+    relative = helping(effects.Drift(), 0.2, 1.0)  # of the same family
+    assert names(_first_in_line([relative, step], 0.05)) == ["drift", "level shift"]
+    other = helping(effects.ExtraInput(), 1e-4, 1e-3)
+    assert names(_first_in_line([other, step], 0.05)) == ["extra input", "level shift"]
+    assert names(_first_in_line([lucky], 0.05)) == ["extra input"]
+
+
+def test_where_noise_alone_is_certain_it_comes_before_structure() -> None:
+    lucky, own = (helping(effects.ExtraInput(), p, 0.5) for p in (0.2, 0.01))
+    for q, first in ((1e-8, "heavy tails"), (0.2, "extra input")):
+        tails = helping(effects.HeavyTails(), 1e-9, q)
+        assert names(_first_in_line([lucky, tails], 0.05)) == [first]
+        assert names(_first_in_line([own, tails], 0.05)) == [first]
+
+
+def test_of_effects_that_are_one_block_the_specific_one_gives_the_name_if_it_is_certain() -> None:
+    """Limits of a sensor and a curve at the output are the same function of the model."""
+
+    def leading(q: float) -> str:
+        limits = spoken_for(effects.Saturation(), 1e-3, q)
+        curve = spoken_for(effects.OutputNonlinearity(), 1e-20, 1e-19)
+        return min([curve, limits], key=lambda one: _specific(one, 0.05)).effect.name
+
+    assert leading(0.01) == "saturation"
+    assert leading(0.3) == "output nonlinearity"
+
+
+@pytest.mark.parametrize(
+    ("q", "others", "too_special"),
+    [
+        (0.01, {"saturation", "output nonlinearity"}, False),
+        (0.3, {"saturation", "output nonlinearity"}, True),
+        (0.3, {"saturation", "dead zone"}, False),
+    ],
+)
+def test_a_special_case_gives_its_name_where_it_is_certain_or_alone(q, others, too_special) -> None:
+    found = spoken_for(effects.Saturation(), 1e-3, q)
+    assert _too_special(found, others, 0.05) == too_special
+
+
+def judged_noise(gains: np.ndarray, errors: np.ndarray, before: np.ndarray) -> _Judged:
+    """A candidate for the noise with gains (N,), and errors of forecasts before and after."""
+    found = spoken_for(effects.HeavyTails(), 1e-9, 1e-8)
+    base = tried(0.0 * gains, errors=before[:, None])
+    return _judge(found, ("after", "one step"), tried(gains, errors=errors[:, None]), base, 1)
+
+
+def test_noise_that_costs_the_forecasts_does_not_help() -> None:
+    before, gains = 3.0 * np.resize([1.0, -1.0], 100), np.ones(100)
+    assert judged_noise(gains, before, before).helps
+    bad = judged_noise(gains, 1.5 * before, before)
+    assert not bad.helps
+    assert "forecasts worse by 50.0 +- 0.0" in bad.attempt.reason
+    assert judged_noise(gains, 1.04 * before, before).helps  # certain, and of no matter
+    assert not judged_noise(gains, 1.06 * before, before).helps
+    wild = before.copy()
+    wild[17] = 1e3  # of the noise, before and after
+    assert judged_noise(gains, wild, wild).helps
+    missing = np.where(np.arange(100) % 3 == 0, np.nan, 1.5 * before)
+    assert not judged_noise(gains, missing, missing / 1.5).helps
+
+
+def test_one_outlier_does_not_hide_what_all_samples_gain() -> None:
+    same = np.ones(300)
+    gains = 0.3 + np.resize([0.4, -0.4], 300)
+    gains[100] = 400.0
+    found = judged_noise(gains, same, same)
+    assert found.helps
+    assert found.attempt.gain < 2.0 * found.attempt.gain_error
+    assert "+99.3 with no sample counted for more than 10" in found.attempt.reason
+    assert not judged_noise(gains - 0.4, same, same).helps
+
+
+@pytest.mark.parametrize("freedom", [2.5, 5.0, 1e3])
+def test_gains_of_nothing_seldom_count(freedom: float) -> None:
+    draws, same = np.random.default_rng(1).standard_t(freedom, (1000, 300)), np.ones(300)
+    count = sum(judged_noise(gains, same, same).helps for gains in draws)
+    # Two standard errors are 2.3 % of normal sums; more where they are estimated from 300 samples.
+    assert binom.sf(count - 1, 1000, 0.04) > 1e-3
+
+
+def test_folds_have_data_on_either_side_of_every_instant() -> None:
+    first, second = interleaved(240)
+    assert not (first & second).any()
+    assert not (first | second)[:20].any()  # the past of the first forecast
+    assert [part.stop - part.start for part in stretches(first)] == [20] * 6
+    assert stretches(np.array([True, False, True, True])) == [slice(0, 1), slice(2, 4)]
+
+
+def test_half_of_the_block_that_is_searched_can_be_fitted_to() -> None:
+    held_out = np.arange(480) >= 240
+    some = shared(held_out)
+    assert some.sum() == 120
+    assert some[-1]
+    assert not some[:240].any()
+    assert not some[240]
+
+
+def test_a_line_of_a_day_is_named_after_the_calendar() -> None:
+    """Where there are time stamps, and both explain the same."""
+    plain = machine(seed=3)
+    stamps = pd.date_range("2021-01-04", periods=len(plain), freq="h", tz="UTC")
+    y = plain.outputs[:, 0] + 0.3 * np.cos(2.0 * np.pi * np.arange(len(plain)) / 24.0)
+    record = dgp.Record(stamps, plain.inputs, y)
+    looked_for = (effects.PeriodicDisturbance(), effects.CalendarEffect())
+    report = dgp.close_loop(
+        fitted(record), record, effects=looked_for, max_rounds=1, workers=1, progress=False
+    )
+    (effect,) = report.effects
+    assert effect.name == "calendar"
+    assert effect.ties in ((), ("periodic disturbance",))
+    assert report.after["rmse"] < 0.06
+
+
+@pytest.mark.parametrize("instant", [150, 300])
+def test_a_step_is_added_wherever_it_is(instant: int) -> None:
+    """Beside a drift, which is scored on other samples, and is worse on the same."""
+    record = machine(seed=3)
+    y = record.outputs[:, 0] + 0.3 * (np.arange(len(record)) >= instant)
+    record = record.with_outputs(y)
+    looked_for = (effects.LevelShift(), effects.Drift())
+    report = dgp.close_loop(
+        fitted(record), record, effects=looked_for, max_rounds=1, workers=1, progress=False
+    )
+    assert [one.name for one in report.effects] == ["level shift"]
+    assert report.after["rmse"] < 0.06
+    mean, sd = next(iter(report.effects[0].parameters.values()))
+    assert mean == pytest.approx(0.3, abs=4.0 * sd + 0.01)
+
+
+@pytest.mark.parametrize("bends", [False, True])
+def test_a_drift_goes_on_as_held_out_data_say(bends: bool) -> None:
+    record = machine()
+    t = np.linspace(0.0, 1.0, len(record))
+    shape = 1.0 - np.exp(-t / 0.3) if bends else t
+    record = record.with_outputs(record.outputs + shape[:, None])
+    report = dgp.close_loop(
+        fitted(record), record, effects=(effects.Drift(),), max_rounds=1, workers=1, progress=False
+    )
+    assert [one.name for one in report.effects] == ["drift"]
+    model = report.fit.model
+    assert (model.pairs == 2) is bends  # a random path
+    assert bool(model.channels) is not bends  # a line
+    # The noise's own is 0.05. What is left of the bend is small; a line would go on to 0.26.
+    assert report.after["rmse"] < (0.1 if bends else 0.06)
+    assert report.before["rmse"] > 3.0 * report.after["rmse"]
+
+
+def test_the_fit_of_the_winner_is_handed_on() -> None:
+    record = machine(weight=0.3)
+    fit = fitted(record)
+    held_out = np.arange(360) >= 240
+    where = {"channel": "heat", "form": "linear", "delay": 0.0}
+    found = spoken_for(effects.ExtraInput(), 1e-9, 1e-8, **where)
+    model = replace(fit.model, scaling=None)
+    variants = tuple(found.effect.extend(model, found.evidence, record))
+    done = confirm(
+        [(found, variants)], fit, record[:360], held_out,
+        number=1, seed=0, level=0.05, workers=1,
+    )  # fmt: skip
+    assert done.winner is found
+    assert done.fit is not None
+    assert done.fit.model.inputs == 2
+    assert len(done.fit.records[0]) == 240  # to what is not held out
+
+
+@pytest.mark.parametrize(("q", "decision"), [(1e-8, "not tried"), (0.5, "rejected")])
+def test_noise_is_tried_where_no_structure_is_certain(q: float, decision: str) -> None:
+    record = machine(weight=0.3)
+    fit = fitted(record)
+    where = {"channel": "heat", "form": "linear", "delay": 0.0}
+    both = [
+        spoken_for(effects.HeavyTails(), 0.01, 0.5, degrees_of_freedom=6.0),
+        spoken_for(effects.ExtraInput(), 1e-9, q, **where),
+    ]
+    model = replace(fit.model, scaling=None)
+    tasks = [(one, tuple(one.effect.extend(model, one.evidence, record))) for one in both]
+    held_out = np.arange(360) >= 240
+    done = confirm(tasks, fit, record[:360], held_out, number=1, seed=0, level=0.05, workers=1)
+    assert done.winner is both[1]
+    decisions = {one.evidence.effect: one.decision for one in done.attempts}
+    assert decisions == {"extra input": "accepted", "heavy tails": decision}
+
+
+def two_inputs() -> dgp.Record:
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal((300, 2))
+    return dgp.Record(np.arange(300) * 3600.0, u, u[:, :1], start="2023-03-01T00:00:00+01:00",
+                      time_unit="s", input_names=("a", "b"))  # fmt: skip
+
+
+def test_inputs_are_delayed_alone_and_together() -> None:
+    record, model = two_inputs(), dgp.LinearDynamicGP(inputs=2, pairs=1)
+    found = spoken_for(effects.DeadTime(), 0.01, 0.1, channel="a", delay=7200.0)
+    variants = effects.DeadTime().extend(model, found.evidence, record)
+    sets = {tuple(c.channel for c in one.channels) for one in variants}
+    assert sets == {("a",), ("b",), ("a", "b")}
+    together = [one for one in variants if len(one.channels) == 2]
+    assert all(a.delay == b.delay for a, b in (one.channels for one in together))
+    finer = effects.DeadTime().refine(together[0], record, 0)
+    assert {len({c.delay for c in one.channels}) for one in finer} == {1}
+    assert "Channels 'a' and 'b' act" in effects.DeadTime().sentence(found.evidence, together[0])
+    again = effects.DeadTime().extend(together[0], found.evidence, record)
+    assert all(isinstance(c, Delayed) for one in again for c in one.channels)
+    assert all(len({c.channel for c in one.channels}) == len(one.channels) for one in again)
+
+
+def test_a_clock_may_be_wrong_for_all_inputs() -> None:
+    record, model = two_inputs(), dgp.LinearDynamicGP(inputs=2, pairs=1)
+    found = spoken_for(effects.ClockShift(), 0.01, 0.1, channel="a", shift=3600.0, time=360000.0)
+    alone, together = effects.ClockShift().extend(model, found.evidence, record)
+    assert [c.channel for c in alone.channels] == ["a"]
+    assert [c.channel for c in together.channels] == ["a", "b"]
+    assert all(isinstance(c, ShiftedClock) for c in together.channels)
+
+
+@pytest.mark.parametrize(("season", "off"), [("summers", [1, 0, 1, 0]), ("winters", [0, 1, 0, 1])])
+def test_a_clock_is_corrected_season_by_season(season: str, off: list[int]) -> None:
+    days = 700
+    start = pd.Timestamp("2023-06-01", tz="UTC")  # Berlin's summers end in October, begin in March
+    value = np.arange(float(days))
+    record = dgp.Record(
+        86400.0 * value, value, value, start=start, input_names=("a",), time_unit="s"
+    )
+    model = dgp.LinearDynamicGP(inputs=1, pairs=1)
+    where = {"channel": "a", "shift": 86400.0, "time": 0.0, "rule": "Europe/Berlin"}
+    found = spoken_for(effects.ClockShift(), 0.01, 0.1, season=season, **where)
+    (one,) = effects.ClockShift().extend(model, found.evidence, record)
+    read = one.check(record)[0].inputs[:, 0] - value
+    middles = [30, 200, 400, 570]  # July, December, July, December
+    assert read[middles].tolist() == off
+
+
+def test_a_calendar_moves_to_another_clock_instead_of_being_there_twice() -> None:
+    record = two_inputs()
+    there = Calendar("hour of day by weekend", "UTC", 4)
+    count = len(there.names)
+    model = dgp.LinearDynamicGP(inputs=2 + count, direct=count, channels=(there,), pairs=1)
+    what = "hour of day by weekday/weekend"
+    found = spoken_for(effects.CalendarEffect(), 0.01, 0.1, what=what, zone="Australia/Melbourne")
+    variants = effects.CalendarEffect().extend(model, found.evidence, record)
+    assert [[(c.what, c.zone, c.harmonics) for c in one.channels] for one in variants] == [
+        [("hour of day by weekend", "Australia/Melbourne", 6)],
+        [("hour of day by weekend", "Australia/Melbourne", 4)],
+    ]
+    assert all(one.inputs - one.direct == 2 for one in variants)
+    assert [one.check(record)[0].n_inputs for one in variants] == [v.inputs for v in variants]
+    same = spoken_for(effects.CalendarEffect(), 0.01, 0.1, what=what, zone="UTC")
+    (finer,) = effects.CalendarEffect().extend(model, same.evidence, record)
+    assert [c.harmonics for c in finer.channels] == [8]
+    (every_three_hours,) = effects.CalendarEffect().extend(model, same.evidence, record[::3])
+    assert [c.harmonics for c in every_three_hours.channels] == [4]
+
+
+def test_feedback_is_among_the_effects_and_changes_nothing() -> None:
+    class Certain(effects.Feedback):
+        def detect(self, residuals: Any, seed: int = 0) -> list[Evidence]:
+            return [spoken_for(self, 1e-9, 1e-9, channel="u").evidence]
+
+    record = machine(seed=5)
+    report = dgp.close_loop(
+        fitted(record), record, effects=(Certain(),), max_rounds=1, workers=1, progress=False
+    )
+    assert [one.name for one in report.effects] == ["feedback"]
+    assert report.before == report.after
+    assert "feedback" in str(report)

@@ -1,0 +1,186 @@
+"""Annealed particles: normalising constants and moments of known densities, models, what breaks."""
+
+import math
+
+import numpy as np
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+
+import pyro_dynogp as dgp
+from pyro_dynogp.criticism.left_out import spread_of
+from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.methods.annealed import Joint, Student, anneal, around
+from pyro_dynogp.inference.posteriors import gaussian_guide
+
+
+def tensor(x):
+    return torch.tensor(x, dtype=torch.float64)
+
+
+class Known:
+    """A density by torch, counted."""
+
+    def __init__(self, log_density):
+        self.log_density, self.calls = log_density, 0
+
+    def __call__(self, z):
+        self.calls += 1
+        x = z.detach().requires_grad_()
+        value = self.log_density(x)
+        (gradient,) = torch.autograd.grad(value.sum(), x)
+        return value.detach(), gradient
+
+
+def normal(count, d, seed=0):
+    return torch.randn(count, d, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def standard(z):
+    return -0.5 * z.square().sum(-1) - 0.5 * z.shape[-1] * math.log(2 * math.pi)
+
+
+def banana(z):
+    """A ridge bent like a parabola, of known moments: z0 ~ N(0, 1), z1 | z0 ~ N(z0^2, 0.3^2)."""
+    first = -0.5 * z[:, 0] ** 2 - 0.5 * math.log(2 * math.pi)
+    off = (z[:, 1] - z[:, 0] ** 2) / 0.3
+    return first - 0.5 * off**2 - math.log(0.3) - 0.5 * math.log(2 * math.pi)
+
+
+def two_peaks(z):
+    """Equal peaks at -3 and 3 in the first coordinate, twice the mass of a density."""
+    return (
+        math.log(2.0)
+        + torch.logaddexp(standard(z - tensor([3.0, 0.0])), standard(z + tensor([3.0, 0.0])))
+        - math.log(2.0)
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_bent_ridge(seed):
+    found = anneal(2.0 * normal(800, 2, seed), Known(lambda z: standard(z / 2) - 2 * math.log(2)),
+                   Known(banana), seed=seed)  # fmt: skip
+    assert found.log_evidence == pytest.approx(0.0, abs=0.25)
+    x, y = found.z.T
+    assert float(x.mean()) == pytest.approx(0.0, abs=0.2)
+    assert float(x.var()) == pytest.approx(1.0, abs=0.3)
+    assert float(y.mean()) == pytest.approx(1.0, abs=0.3)
+    assert float((y - x**2).std()) == pytest.approx(0.3, rel=0.15)
+    assert found.temperatures[-1] == 1.0
+    assert all(0.4 < rate <= 1.0 for rate in found.acceptance)
+    assert len(np.unique(found.ancestor)) > 80
+
+
+def test_two_peaks_keep_their_shares():
+    wide = Known(lambda z: standard(z / 4) - 2 * math.log(4))
+    found = anneal(4.0 * normal(1000, 2), wide, Known(two_peaks))
+    assert found.log_evidence == pytest.approx(math.log(2.0), abs=0.2)
+    assert float((found.z[:, 0] > 0).double().mean()) == pytest.approx(0.5, abs=0.1)
+
+
+def test_the_evidence_is_unbiased():
+    """Over repeated runs the mean of exp(log evidence) is the constant, 1."""
+    target = Known(lambda z: standard((z - 1.5) / 0.5) - 3 * math.log(0.5))
+    values = [
+        math.exp(anneal(normal(60, 3, seed), Known(standard), target, seed=seed).log_evidence)
+        for seed in range(60)
+    ]
+    error = np.std(values) / np.sqrt(len(values))
+    assert error < 0.2
+    assert np.mean(values) == pytest.approx(1.0, abs=4 * error)
+
+
+def test_the_same_density_needs_one_step_and_changes_nothing_but_by_moves():
+    z = normal(300, 2)
+    found = anneal(z, Known(standard), Known(standard))
+    assert found.temperatures == (1.0,)
+    assert found.log_evidence == pytest.approx(0.0, abs=1e-12)
+    again = anneal(z, Known(standard), Known(standard))
+    assert torch.equal(found.z, again.z)  # the same seed
+
+
+def test_a_target_that_no_particle_can_reach():
+    nowhere = Known(lambda z: standard(z) - torch.inf)
+    with pytest.raises(RuntimeError, match="no particle has a density"):
+        anneal(normal(50, 2), Known(standard), nowhere)
+
+
+def test_student_start():
+    guide = type("G", (), {"loc": tensor([1.0, -2.0]), "scale_tril": tensor([[1.0, 0], [0.5, 2]])})
+    z, student = around(guide, 4000, seed=1)
+    value, gradient = student(z)
+    exact = dist.MultivariateStudentT(tensor(5.0), guide.loc, guide.scale_tril).log_prob(z)
+    torch.testing.assert_close(value, exact)
+    x = z[:5].clone().requires_grad_()
+    (slope,) = torch.autograd.grad(Student(guide.loc, guide.scale_tril).distribution
+                                   .log_prob(x).sum(), x)  # fmt: skip
+    torch.testing.assert_close(gradient[:5], slope)
+    inside = torch.linalg.solve_triangular(guide.scale_tril, (z - guide.loc).mT, upper=False)
+    # Squared radii over d are F(2, 5), whose median is 0.799.
+    assert float((inside.square().sum(0) / 2).median()) == pytest.approx(0.799, abs=0.06)
+
+
+def test_posterior_of_a_conjugate_model():
+    """Sites with transforms: a precision with a gamma prior, a mean given it."""
+    y = tensor([0.3, 1.2, -0.4, 2.0, 0.9])
+
+    def model():
+        tau = pyro.sample("tau", dist.Gamma(tensor(3.0), tensor(2.0)))
+        mu = pyro.sample("mu", dist.Normal(tensor(0.0), (2.0 / tau).sqrt()))
+        pyro.sample("y", dist.Normal(mu.unsqueeze(-1), tau.rsqrt().unsqueeze(-1)).expand(
+            [*mu.shape, 5]).to_event(1), obs=y)  # fmt: skip
+
+    potential = Potential(model, (), {"tau": tensor(1.0), "mu": tensor(0.5)})
+    loc = tensor([math.log(1.2), 0.8])
+    guide = gaussian_guide(potential, loc, 0.6 * torch.eye(2, dtype=torch.float64))
+    z, start = around(guide, 1500, 0)
+    found = anneal(z, start, Joint(model, (), potential.sites))
+    values = potential.unpack(found.z)
+    n, lam = 5, 0.5
+    mean = n * y.mean() / (n + lam)
+    a = 3.0 + n / 2
+    b = 2.0 + 0.5 * ((y - y.mean()) ** 2).sum() + 0.5 * lam * n / (lam + n) * y.mean() ** 2
+    assert float(values["mu"].mean()) == pytest.approx(float(mean), abs=0.06)
+    assert float(values["tau"].mean()) == pytest.approx(float(a / b), rel=0.06)
+    exact = (
+        math.lgamma(a) - math.lgamma(3.0) + 3.0 * math.log(2.0) - a * math.log(b)
+        + 0.5 * math.log(lam / (n + lam)) - 0.5 * n * math.log(2 * math.pi)
+    )  # fmt: skip
+    assert found.log_evidence == pytest.approx(float(exact), abs=0.15)
+
+
+def test_one_bad_particle_does_not_spoil_the_others(record):
+    model = dgp.LinearDynamicGP(inputs=1, pairs=1).scaled_to(record)
+    with torch.random.fork_rng(), torch.no_grad(), pyro.poutine.block():
+        torch.manual_seed(0)
+        trace = pyro.poutine.trace(model).get_trace(record)
+    values = {n: s["value"] for n, s in trace.nodes.items() if s["type"] == "sample" and n != "y"}
+    potential = Potential(model, (record,), values)
+    joint = Joint(model, (record,), potential.sites)
+    z = potential.pack(values)
+    batch = torch.stack([z, z + 0.01, torch.full_like(z, 1e3), z.clone()])
+    batch[3, 0] = torch.nan
+    value, gradient = joint(batch)
+    assert torch.isinf(value[2:]).all()
+    assert not gradient[2:].any()
+    for k in (0, 1):
+        energy, slope = potential.value_and_gradient(batch[k].numpy(), jacobian=True)
+        assert float(value[k]) == pytest.approx(-energy, rel=1e-10)
+        np.testing.assert_allclose(gradient[k].numpy(), -slope, rtol=1e-7, atol=1e-7)
+
+
+def test_the_error_of_a_mean_is_its_spread_over_seeds():
+    """Shares of two peaks: far from each other, so that only the first particles make them."""
+    wide = Known(lambda z: standard(z / 4) - 2 * math.log(4))
+    shares, errors, naive = [], [], []
+    for seed in range(60):
+        found = anneal(4.0 * normal(200, 2, seed), wide, Known(two_peaks), seed=seed)
+        right = (found.z[:, 0] > 0).double().numpy()
+        influence = (right - right.mean()) / len(right)
+        shares.append(right.mean())
+        errors.append(spread_of(influence, found.ancestor))
+        naive.append(spread_of(influence, None))
+    spread = np.std(shares)
+    assert np.mean(naive) < 0.8 * spread
+    assert np.mean(errors) == pytest.approx(spread, rel=0.3)

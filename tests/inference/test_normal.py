@@ -1,0 +1,73 @@
+"""SVI around Laplace's approximation, and where there is nothing for it to do."""
+
+import math
+
+import numpy as np
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+from scipy.stats import multivariate_normal
+
+from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.methods.normal import AS_GOOD, CLOSE, log_weights, variational
+
+X = torch.tensor([[1.0, 0.5], [-0.3, 2.0], [0.7, 0.7]], dtype=torch.float64)
+Y = torch.tensor([0.4, -1.1, 0.9], dtype=torch.float64)
+NOISE = 0.5
+
+
+def normal(y):
+    zero = torch.zeros(2, dtype=torch.float64)
+    w = pyro.sample("w", dist.Normal(zero, 1.0).to_event(1))
+    mean = (X @ w[..., None])[..., 0]
+    pyro.sample("y", dist.Normal(mean, NOISE).to_event(1), obs=y)
+
+
+def skewed(y):
+    """A scale from three samples: its posterior has a long tail in the logarithm, too."""
+    sd = pyro.sample("sd", dist.HalfCauchy(torch.ones((), dtype=torch.float64)))
+    pyro.sample("y", dist.Normal(0.0, sd[..., None]).expand(sd.shape + y.shape).to_event(1), obs=y)
+
+
+def evidence():
+    covariance = X @ X.T + NOISE**2 * torch.eye(3, dtype=torch.float64)
+    return multivariate_normal(np.zeros(3), covariance.numpy()).logpdf(Y.numpy())
+
+
+def test_where_the_posterior_is_normal_nothing_is_trained():
+    found = variational(normal, (Y,), {"w": torch.zeros(2, dtype=torch.float64)}, steps=50)
+    assert found.message == AS_GOOD
+    assert found.elbo == pytest.approx([evidence()], abs=1e-4)
+    precision = torch.eye(2, dtype=torch.float64) + X.T @ X / NOISE**2
+    exact = torch.linalg.solve(precision, X.T @ Y / NOISE**2)
+    # The climb ends within FLAT standard deviations, by differences of gradients over 1e-4.
+    torch.testing.assert_close(found.guide.loc, exact, atol=1e-3, rtol=0.0)
+    root = found.guide.scale_tril
+    torch.testing.assert_close(root @ root.T, torch.linalg.inv(precision), atol=1e-4, rtol=1e-4)
+
+
+def test_where_it_is_not_svi_raises_the_elbo():
+    start = {"sd": torch.ones((), dtype=torch.float64)}
+    found = variational(skewed, (Y,), start, steps=300, particles=32)
+    assert found.message != AS_GOOD
+    assert len(found.elbo) > 50
+    potential = Potential(skewed, (Y,), start)
+    centre, root = (torch.as_tensor(x) for x in potential.laplace(start, widest=2.0))
+    many = torch.cat([log_weights(potential, centre, root, seed) for seed in range(40)])
+    assert 0.5 * many.var() > CLOSE
+    assert found.elbo[-50:].mean() > many.mean()
+
+
+def test_log_weights_are_the_divergence_of_a_wrong_normal():
+    """Of a normal that is too wide by known factors: KL in closed form, and half the variance."""
+    potential = Potential(normal, (Y,), {"w": torch.zeros(2, dtype=torch.float64)})
+    centre, root = potential.laplace({"w": torch.zeros(2, dtype=torch.float64)}, widest=2.0)
+    wide = torch.as_tensor(root) * 1.1
+    many = torch.cat([
+        log_weights(potential, torch.as_tensor(centre), wide, seed) for seed in range(60)
+    ])  # fmt: skip
+    divergence = 2 * (0.5 * (1.1**2 - 1.0) - math.log(1.1))
+    # Monte Carlo of 1920 draws: four standard errors of the mean, two of the variance.
+    assert evidence() - float(many.mean()) == pytest.approx(divergence, abs=0.02)
+    assert 0.5 * float(many.var()) == pytest.approx(0.5 * (1.1**2 - 1.0) ** 2, rel=0.15)

@@ -1,0 +1,1 @@
+"""Stored results of fits, leave-one-out and closed loops, for comparison with later versions."""
