@@ -45,16 +45,17 @@ if TYPE_CHECKING:
     from pyro_dynogp.lti.modes import Modes
     from pyro_dynogp.lti.state import ModalState
     from pyro_dynogp.models.architectures import (
+        Cascade,
         Hammerstein,
         HammersteinWiener,
+        LinearDynamicGP,
         Wiener,
         WienerHammerstein,
     )
-    from pyro_dynogp.models.linear import LinearDynamicGP
-    from pyro_dynogp.models.model import Cascade
-    from pyro_dynogp.models.outputs import ObservedCascade
+    from pyro_dynogp.models.model import Model
+    from pyro_dynogp.models.output_process import OutputProcess
     from pyro_dynogp.models.priors import TimeScale, sample_modes
-    from pyro_dynogp.models.system import CascadeSystem
+    from pyro_dynogp.models.system import System
     from pyro_dynogp.models.wiring import Dynamic, Static
     from pyro_dynogp.prediction.prediction import Prediction
     from pyro_dynogp.prediction.scores import scores
@@ -64,8 +65,8 @@ __version__ = "0.1.0"
 # Names are imported when they are first used (PEP 562), so that the command line answers at once.
 _HOME = {
     "Calibration": "pyro_dynogp.criticism.calibration",
-    "Cascade": "pyro_dynogp.models.model",
-    "CascadeSystem": "pyro_dynogp.models.system",
+    "Cascade": "pyro_dynogp.models.architectures",
+    "System": "pyro_dynogp.models.system",
     "Check": "pyro_dynogp.criticism.check",
     "Comparison": "pyro_dynogp.criticism.comparison",
     "ConditionedLTIProcess": "pyro_dynogp.distributions.conditioned",
@@ -87,12 +88,13 @@ _HOME = {
     "LTIProcess": "pyro_dynogp.distributions.process",
     "LayerGuide": "pyro_dynogp.guides.layer_guide",
     "Likelihood": "pyro_dynogp.layers.noise",
-    "LinearDynamicGP": "pyro_dynogp.models.linear",
+    "LinearDynamicGP": "pyro_dynogp.models.architectures",
+    "Model": "pyro_dynogp.models.model",
     "LogDecayRate": "pyro_dynogp.distributions.decay",
     "MeanField": "pyro_dynogp.guides.families",
     "ModalState": "pyro_dynogp.lti.state",
     "Modes": "pyro_dynogp.lti.modes",
-    "ObservedCascade": "pyro_dynogp.models.outputs",
+    "OutputProcess": "pyro_dynogp.models.output_process",
     "ObservedLTIProcess": "pyro_dynogp.distributions.process",
     "Point": "pyro_dynogp.guides.families",
     "Prediction": "pyro_dynogp.prediction.prediction",
@@ -132,7 +134,6 @@ _MODULES = {"datasets": "pyro_dynogp.examples.datasets", "plotting": "pyro_dynog
 __all__ = [
     "Calibration",
     "Cascade",
-    "CascadeSystem",
     "Check",
     "Comparison",
     "ConditionedLTIProcess",
@@ -158,9 +159,10 @@ __all__ = [
     "LogDecayRate",
     "MeanField",
     "ModalState",
+    "Model",
     "Modes",
-    "ObservedCascade",
     "ObservedLTIProcess",
+    "OutputProcess",
     "Point",
     "Prediction",
     "PredictiveChecks",
@@ -173,6 +175,7 @@ __all__ = [
     "Static",
     "StaticFunction",
     "StudentT",
+    "System",
     "TimeScale",
     "TrainingDivergedError",
     "Wiener",

@@ -3,42 +3,36 @@ r"""Log-density of each measured output given other outputs, all trajectories in
 Given the parameters a trajectory is never sampled, and never conditioned on by the sample that it
 is to predict: such conditional densities say how well a smoother fits, not how well it predicts.
 
-- "missing sample": p(y_i | all outputs but y_i). Exact in O(n) for a Gaussian process with
-  covariance C of the samples, whose leave-one-out moments are mean y_i - [C^{-1} r]_i/[C^{-1}]_ii
-  and variance 1/[C^{-1}]_ii (Sundararajan & Keerthi 2001); by the moment-matching smoother for
-  other cascades.
+- "missing sample": p(y_i | all outputs but y_i).
 - "forecast": p(y_i | outputs at least `horizon` samples before). At horizon 1 outputs of one time
   follow one another, so that the densities add up to that of the whole record.
 """
 
 from __future__ import annotations
 
-import math
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from pyro_dynogp.distributions import pointwise
+from pyro_dynogp.distributions.pointwise import Moments
 from pyro_dynogp.distributions.process import ObservedLTIProcess
-from pyro_dynogp.distributions.trajectory import apply, split_missing
-from pyro_dynogp.lti.filtering import predict_k_steps
-from pyro_dynogp.models.assembly import assemble
-from pyro_dynogp.models.outputs import ObservedCascade
-from pyro_dynogp.moments import filtering, smoothing
-from pyro_dynogp.moments.problem import each
+from pyro_dynogp.models.output_process import OutputProcess
 from pyro_dynogp.support.errors import invalid
 
 Kind = Literal["missing sample", "forecast"]
 
 
 def pointwise_log_density(
-    observed: Any, outputs: Tensor, kind: Kind, *, horizon: int = 1
+    observed: ObservedLTIProcess | OutputProcess, outputs: Tensor, kind: Kind, *, horizon: int = 1
 ) -> np.ndarray:
     """Log-density (S, n, n_y) of each output for each element of a batch (S,) of parameters.
 
     Args:
-        observed: an `ObservedLTIProcess` or an `ObservedCascade`, batch shape (S,) or ().
+        observed: a distribution of outputs whose trajectories are integrated out, batch shape (S,)
+            or ().
         outputs: y (*event) [output], NaN where missing.
         kind: what is given. horizon: of "forecast" [samples], at least 1.
 
@@ -54,60 +48,32 @@ def pointwise_log_density(
     if not isinstance(horizon, int) or horizon < 1:
         raise invalid("horizon", expected="a whole number >= 1", got=repr(horizon))
     with torch.no_grad():
+        if isinstance(observed, OutputProcess):
+            density = _of_outputs(observed, outputs, kind, horizon).log_density
+            return density.reshape(-1, *density.shape[-2:]).numpy()
         if isinstance(observed, ObservedLTIProcess):
-            return _linear(observed, outputs, kind, horizon)
-        if isinstance(observed, ObservedCascade):
-            return _cascade(observed, outputs, kind, horizon)
+            density = _of_process(observed, outputs, kind, horizon).log_density
+            n, n_y = len(observed.process.grid), observed.modes.outputs
+            return density.reshape(-1, n, n_y).numpy()
     raise invalid(
         "observed",
         expected="an observed site whose trajectories are integrated out (LTIProcess.observed, "
-        "or ObservedCascade)",
+        "or a model of this package)",
         got=type(observed).__name__,
         advice="Densities given a sampled trajectory, which has seen the sample itself, are off by "
         "tens of nats. Integrate the trajectory, or give `pointwise` densities of your own.",
     )
 
 
-def _linear(observed: ObservedLTIProcess, y: Tensor, kind: Kind, horizon: int) -> np.ndarray:
-    residual, missing = split_missing(observed.rows(y - observed.mean))
-    v = observed.noise_rows
-    v = v if missing is None else v.masked_fill(missing, torch.inf)
-    K = observed.covariance(v)
+def _of_outputs(observed: OutputProcess, y: Tensor, kind: Kind, horizon: int) -> Moments:
     if kind == "missing sample":
-        precision = K.inverse_diagonal()
-        variance = 1.0 / precision
-        departure = apply(K.solve, K, residual) * variance
-    elif horizon == 1:
-        variance = K.innovation_variance
-        departure = apply(K.innovations, K, residual)
-    else:
-        moments = predict_k_steps(K, residual, horizon)
-        variance = moments.variance + observed.noise_rows
-        departure = residual - moments.mean
-    log_density = -0.5 * (math.log(2.0 * math.pi) + variance.log() + departure.square() / variance)
-    if missing is not None:
-        log_density = log_density.masked_fill(missing, torch.nan)
-    n = len(observed.process.grid)
-    return log_density.reshape(-1, n, observed.modes.outputs).numpy()
+        return observed.left_out(y)
+    return observed.one_step(y) if horizon == 1 else observed.ahead(y, horizon)
 
 
-def _cascade(observed: ObservedCascade, y: Tensor, kind: Kind, horizon: int) -> np.ndarray:
-    scaled = y if y.dim() > 1 else y.unsqueeze(-1)
-    scaled = (scaled - observed.shift) / observed.scale
-    problem = assemble(observed.system, observed.grid, observed.inputs).with_outputs(scaled)
-    layout = problem.layout
-    elements, _ = problem.elements()
-
-    def density(b: int) -> np.ndarray:
-        values = elements[b]
-        if kind == "missing sample":
-            _, means, covariances, _, _ = filtering.run(layout, values)
-            found = smoothing.leave_one_out(layout, values, means, covariances)
-        elif horizon == 1:
-            found = smoothing.innovate(layout, values)
-        else:
-            found = smoothing.predict_ahead(layout, values, horizon)
-        return np.asarray(found[2])
-
-    log_density = np.stack(each(density, len(elements)))
-    return log_density - np.log(observed.scale.numpy())
+def _of_process(observed: ObservedLTIProcess, y: Tensor, kind: Kind, horizon: int) -> Moments:
+    if kind == "missing sample":
+        return pointwise.left_out(observed, y)
+    if horizon == 1:
+        return pointwise.one_step(observed, y)
+    return pointwise.ahead(observed, y, horizon)

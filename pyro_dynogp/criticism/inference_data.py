@@ -27,10 +27,9 @@ from pyro_dynogp.criticism.site_dimensions import (
 from pyro_dynogp.criticism.subjects import densities_at
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.posteriors import MixtureGuide
-from pyro_dynogp.models.model import Cascade
-from pyro_dynogp.models.outputs import collapsed_of
+from pyro_dynogp.models.output_process import OutputProcess
+from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.prediction.first_state import beginning
-from pyro_dynogp.prediction.linear import prior_process
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.parallel import seeded
 
@@ -272,10 +271,8 @@ def prior_draws(fit: Fit, count: int, seed: int) -> tuple[dict[str, Tensor], Any
 def one_step_densities(fit: Fit, record: Record) -> np.ndarray:
     """Log-density (S, n, n_y) [nats] of each output given those before it, at each draw."""
 
-    def observed(some: Fit) -> Any:
-        if isinstance(some.model, Cascade):
-            return collapsed_of(beginning(some, record), some.scaling, record)
-        return prior_process(some, record).observed(some.system.noise_sd)
+    def observed(some: Fit) -> OutputProcess:
+        return output_process(beginning(some, record), some.scaling, record)
 
     return densities_at(fit, fit.draws, record, observed, "forecast")
 

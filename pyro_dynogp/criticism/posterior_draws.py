@@ -21,7 +21,6 @@ from pyro_dynogp.inference.density import Potential, log_prob_by_draw
 from pyro_dynogp.inference.methods import annealed as annealing
 from pyro_dynogp.inference.posteriors import GaussianGuide, MixtureGuide, gaussian_guide
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
-from pyro_dynogp.models.model import Cascade
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.parallel import seeded
 
@@ -174,7 +173,7 @@ def _annealed(
 ) -> PosteriorDraws:
     """Draws of the posterior where the fit's own normal, of Pareto shape k, will not do."""
     shape = apart(k, arviz_bridge.good_k(count))[0]
-    if isinstance(fit.model, Cascade):  # annealing would take an hour
+    if fit.model.has_function:  # annealing would take an hour
         if fit.method == "svi":
             return own  # the posterior that was chosen; its k goes with every result
         raise invalid(

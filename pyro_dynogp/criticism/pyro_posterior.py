@@ -64,7 +64,7 @@ class PyroPosterior:
         Missing and masked samples are left out, in the order of `places`.
 
         Where a trajectory is integrated out by the site's own distribution (`LTIProcess.observed`,
-        `ObservedCascade`): as `criticism.densities` has them. Where a site factorises, and no
+        `OutputProcess`): as `criticism.densities` has them. Where a site factorises, and no
         latent site is a trajectory: the density given the draw, of either kind, since samples are
         then independent given the draw. A latent time series of another make than this package's
         is not recognised as one: its densities would be given what the sample itself has told it.

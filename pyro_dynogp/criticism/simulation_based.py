@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -17,31 +17,22 @@ from pyro_dynogp.criticism.rank_results import SimulationBasedCalibration, judge
 from pyro_dynogp.criticism.ranks import rank_of
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.fit import fit
-from pyro_dynogp.models.linear import LinearDynamicGP
-from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.models.model import Model
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.parallel import child_seeds, parallel_map, seeded
 
 if TYPE_CHECKING:
     from pyro_dynogp.inference.fitted import Fit
 
-Model = LinearDynamicGP | Cascade
 JOINT = "log joint"
 # NUTS draws so many times as many as are kept, so that those are nearly independent.
 THIN = 5
 
 
-class _FixedLinear(LinearDynamicGP):
-    """A linear model that keeps its scaling, and with it its prior, whatever it is fitted to."""
+class _Fixed(Model):
+    """A model that keeps its scaling, and with it its prior, whatever it is fitted to."""
 
-    def scaled_to(self, records: Any) -> LinearDynamicGP:
-        return self
-
-
-class _FixedCascade(Cascade):
-    """The same of a cascade."""
-
-    def scaled_to(self, records: Any) -> Cascade:
+    def scaled_to(self, records: Record | Sequence[Record]) -> Model:
         return self
 
 
@@ -120,8 +111,7 @@ def simulation_based_calibration(
             cannot have here; where no replicate could be fitted.
     """
     _check(model, record, method, replicates, draws, level, fit_options)
-    kind = _FixedCascade if isinstance(model, Cascade) else _FixedLinear
-    fixed = kind(**{f.name: getattr(model, f.name) for f in dataclasses.fields(model) if f.init})
+    fixed = _Fixed(**{f.name: getattr(model, f.name) for f in dataclasses.fields(model) if f.init})
     model.check(record)
     blank = record.with_outputs(np.empty((len(record), 0)), names=(), units=())
     gaps = record.missing if record.n_outputs else np.zeros((len(record), model.outputs), bool)
@@ -159,7 +149,7 @@ def simulation_based_calibration(
 def _check(
     model: Any, record: Any, method: Any, replicates: Any, draws: Any, level: Any, options: Any
 ) -> None:
-    if not isinstance(model, LinearDynamicGP | Cascade):
+    if not isinstance(model, Model):
         raise invalid("model", expected="a LinearDynamicGP or a Cascade", got=type(model).__name__)
     if model.scaling is None:
         raise invalid(

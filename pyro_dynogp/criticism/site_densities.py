@@ -12,7 +12,7 @@ from torch import Tensor
 from pyro_dynogp.criticism.densities import Kind, pointwise_log_density
 from pyro_dynogp.distributions.process import ObservedLTIProcess
 from pyro_dynogp.distributions.trajectory import Trajectory
-from pyro_dynogp.models.outputs import ObservedCascade
+from pyro_dynogp.models.output_process import OutputProcess
 
 AROUND = (torch.distributions.Independent, dist.MaskedDistribution, dist.ExpandedDistribution)
 
@@ -26,12 +26,12 @@ def inside(distribution: Any) -> Any:
 
 def is_trajectory(distribution: Any) -> bool:
     """Whether a site's value is a whole trajectory, measured or not."""
-    return isinstance(inside(distribution), Trajectory | ObservedCascade)
+    return isinstance(inside(distribution), Trajectory | OutputProcess)
 
 
 def is_integrated(distribution: Any) -> bool:
     """Whether a site's value is measured along a trajectory that is integrated out."""
-    return isinstance(inside(distribution), ObservedLTIProcess | ObservedCascade)
+    return isinstance(inside(distribution), ObservedLTIProcess | OutputProcess)
 
 
 def is_masked(distribution: Any) -> bool:

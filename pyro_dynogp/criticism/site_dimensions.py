@@ -3,128 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
 from pyro_dynogp.criticism.labelled import Coordinate, clock_of
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.scaling import Scaling
-from pyro_dynogp.models.linear import LinearDynamicGP
-from pyro_dynogp.models.model import Cascade
-from pyro_dynogp.models.wiring import INPUTS, Dynamic, Layer
+from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.wiring import INPUTS
 
 # The two numbers of a gain (see `sample_modes`), and of a complex number.
 TERM = ("derivative", "steady state")
 PART = ("real", "imaginary")
 
 
-@dataclass(frozen=True)
-class Place:
-    """A layer and the names of its dimensions.
-
-    Attributes:
-        name: prefix of its sites. layer: what it is.
-        inputs: name of the dimension of what it sees. outputs: of what it gives.
-        alone: whether it is the only dynamic, or the only static, layer.
-        channels: labels of what it sees.
-    """
-
-    name: str
-    layer: Layer
-    inputs: str
-    outputs: str
-    alone: bool
-    channels: tuple[str, ...]
-
-    def own(self, dim: str) -> str:
-        """Name of a dimension that other layers of its kind have with another length."""
-        return dim if self.alone else f"{self.name}_{dim}"
-
-
-def places_of(model: LinearDynamicGP | Cascade, scaling: Scaling) -> tuple[Place, ...]:
-    """All layers of a model; a linear one is a dynamic layer g."""
-    if isinstance(model, LinearDynamicGP):
-        layer = Dynamic(outputs=model.outputs, pairs=model.pairs)
-        return (Place("g", layer, "input", "output", True, scaling.input_names),)
-    widths = {INPUTS: scaling.input_names}
-    places = []
-    for one in model.wires:
-        kinds = [type(layer) for layer in model.layers]
-        places.append(
-            Place(
-                one.name,
-                one.layer,
-                "input" if one.sources == (INPUTS,) else f"{one.name}_input",
-                "output" if one.last else f"{one.name}_output",
-                kinds.count(type(one.layer)) == 1,
-                tuple(label for source in one.sources for label in widths[source]),
-            )
-        )
-        several = one.layer.outputs > 1
-        widths[one.name] = tuple(
-            f"{one.name}[{a}]" if several else one.name for a in range(one.layer.outputs)
-        )
-    return tuple(places)
-
-
 def site_dimensions(
-    model: LinearDynamicGP | Cascade, scaling: Scaling, records: Sequence[Record]
+    model: Model, scaling: Scaling, records: Sequence[Record]
 ) -> dict[str, tuple[str, ...]]:
-    """Names of the dimensions of each site that a model may have, and of its trajectories.
-
-    Sites that are not here, hyperparameters of a user's kernel, have no names for theirs.
-    """
-    out: dict[str, tuple[str, ...]] = {"offset": ("output",), "noise_sd": ("output",)}
-    suffixes = suffixes_of(records)
-    for place in places_of(model, scaling):
-        name, several = place.name, place.layer.outputs > 1
-        if isinstance(place.layer, Dynamic):
-            out |= _dynamic(place)
-        else:
-            own_kernel = place.layer.kernel is not None
-            out |= _static(name, place.inputs, place.outputs, place.own("inducing"), own_kernel)
-            out[f"{name}_residual"] = (place.outputs, place.own("support"))
-        for suffix in suffixes:
-            out[f"{name}{suffix}"] = (f"time{suffix}", *([place.outputs] if several else []))
-            linear = isinstance(model, LinearDynamicGP)
-            state = f"initial_state{suffix}" if linear else f"{name}_initial_state{suffix}"
-            out[state] = (place.own("state"),)
-    follows = isinstance(model, Cascade) and model.likelihood.of == "output"
-    driver = "output" if follows else "input"
-    return out | _static("log_noise", driver, "output", "log_noise_inducing", False)
-
-
-def _dynamic(place: Place) -> dict[str, tuple[str, ...]]:
-    pair, brownian = place.own("pair"), place.own("brownian")
-    several = place.layer.outputs > 1
-    sites = {
-        "log_decay": (pair,),
-        "log_frequency": (pair,),
-        "input_gain": (pair, place.inputs, "term"),
-        "output_gain": (place.outputs, pair, "part"),
-        "feedthrough": (place.outputs, place.inputs) if several else (place.inputs,),
-        "noise_gain_local_scale": (pair,),
-        "noise_gain_unit": (pair, brownian, "term"),
-    }
-    return {f"{place.name}_{site}": dims for site, dims in sites.items()}
-
-
-def _static(
-    name: str, inputs: str, outputs: str, inducing: str, own_kernel: bool
-) -> dict[str, tuple[str, ...]]:
-    sites: dict[str, tuple[str, ...]] = {
-        "output_scale": (outputs,),
-        "constant": (outputs,),
-        "slope": (outputs, inputs),
-        "center": (inputs,),
-        "half_width": (inputs,),
-        "locations": (inducing, inputs),
-        "values": (outputs, inducing),
-    }
-    if not own_kernel:
-        sites["lengthscale"] = (inputs,)
-    return {f"{name}_{site}": dims for site, dims in sites.items()}
+    """Names of the dimensions of each site of a model, and of its trajectories."""
+    explicit = replace(model, integrate="none")  # with what is drawn beside the parameters
+    out = {site.name: site.dims for site in explicit.all_sites(scaling, len(records))}
+    for wire in model.wires:
+        several = (wire.dims["output"],) if wire.layer.outputs > 1 else ()
+        for suffix in suffixes_of(records):
+            out[f"{wire.name}{suffix}"] = (f"time{suffix}", *several)
+    return out
 
 
 def suffixes_of(records: Sequence[Record]) -> tuple[str, ...]:
@@ -132,9 +36,7 @@ def suffixes_of(records: Sequence[Record]) -> tuple[str, ...]:
     return ("",) if len(records) == 1 else tuple(f"_{index}" for index in range(len(records)))
 
 
-def labels_of(
-    model: LinearDynamicGP | Cascade, scaling: Scaling, records: Sequence[Record]
-) -> dict[str, Coordinate]:
+def labels_of(model: Model, scaling: Scaling, records: Sequence[Record]) -> dict[str, Coordinate]:
     """Labels of all dimensions that have a meaning: channels with their units, time, terms."""
     labels: dict[str, Coordinate] = {
         "term": ("term", np.array(TERM), {}),
@@ -148,9 +50,15 @@ def labels_of(
         if names:
             labels[dim] = (dim, np.array(names), {})
             labels[f"{dim}_unit"] = (dim, np.array(units), {})
-    for place in places_of(model, scaling):
-        if place.inputs != "input" and place.channels:
-            labels[place.inputs] = (place.inputs, np.array(place.channels), {})
+    signals = {INPUTS: scaling.input_names}
+    for wire in model.wires:
+        seen = tuple(label for source in wire.sources for label in signals[source])
+        if wire.sources != (INPUTS,) and seen:
+            dim = wire.dims["input"]
+            labels[dim] = (dim, np.array(seen), {})
+        width = wire.layer.outputs
+        several = tuple(f"{wire.name}[{a}]" for a in range(width))
+        signals[wire.name] = several if width > 1 else (wire.name,)
     for suffix, record in zip(suffixes_of(records), records, strict=True):
         labels |= clock_of(record, f"time{suffix}")
     return labels

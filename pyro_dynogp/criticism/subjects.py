@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
 import torch
@@ -21,9 +21,8 @@ from pyro_dynogp.criticism.posterior_draws import (
 )
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.refit import refit
-from pyro_dynogp.models.model import Cascade
-from pyro_dynogp.models.outputs import collapsed_of
-from pyro_dynogp.prediction.linear import prior_process, process_given
+from pyro_dynogp.models.output_process import OutputProcess
+from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
@@ -114,7 +113,7 @@ class FitSubject:
     def _along(self, record: Record, index: int | None, kind: Kind, horizon: int) -> np.ndarray:
         """Densities of a record's measured samples."""
 
-        def observed(part: Fit) -> Any:
+        def observed(part: Fit) -> OutputProcess:
             return observed_of(part, record, index)
 
         found = densities_at(self.fit, self.draws.values, record, observed, kind, horizon)
@@ -140,7 +139,7 @@ def densities_at(
     fit: Fit,
     values: Values,
     record: Record,
-    observed: Callable[[Fit], Any],
+    observed: Callable[[Fit], OutputProcess],
     kind: Kind,
     horizon: int = 1,
 ) -> np.ndarray:
@@ -162,7 +161,7 @@ def densities_at(
     return np.concatenate(parts)
 
 
-def observed_of(fit: Fit, record: Record, index: int | None) -> Any:
+def observed_of(fit: Fit, record: Record, index: int | None) -> OutputProcess:
     """Distribution of a record's outputs for each draw of a fit.
 
     Args:
@@ -170,17 +169,11 @@ def observed_of(fit: Fit, record: Record, index: int | None) -> Any:
         index: of the training record whose first state the draws know; None where the first state
             is unknown.
     """
-    model, system = fit.model, fit.system
-    suffix = "" if len(fit.records) == 1 else f"_{index}"
-    if isinstance(model, Cascade):
-        states = {}
-        if index is not None:
-            names = {one.name: f"{one.name}_initial_state{suffix}" for one in model.state_sites}
-            states = {layer: fit.draws[site] for layer, site in names.items()}
-        return collapsed_of(model.begin(system, states), fit.scaling, record)
+    states = {}
     if index is not None:
-        return process_given(fit, record, index).observed(system.noise_sd)
-    return prior_process(fit, record, unknown_start=True).observed(system.noise_sd)
+        suffix = "" if len(fit.records) == 1 else f"_{index}"
+        states = fit.model.states_of(fit.draws, suffix)
+    return output_process(fit.model.begin(fit.system, states), fit.scaling, record)
 
 
 @dataclass(frozen=True, eq=False)

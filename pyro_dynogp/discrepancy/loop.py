@@ -18,8 +18,7 @@ from pyro_dynogp.effects import CATALOGUE, Effect
 from pyro_dynogp.inference.fit import fit as fit_model
 from pyro_dynogp.inference.fitted import Method
 from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
-from pyro_dynogp.models.model import Cascade
-from pyro_dynogp.models.variants import has_function, used_channels
+from pyro_dynogp.models.variants import used_channels
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.parallel import one_thread, parallel_map
 
@@ -133,8 +132,8 @@ def _final(fits: Sequence[Fit], record: Record, workers: int | None, progress: b
 
     def one(given: Fit) -> Fit:
         model = replace(given.model, scaling=None)
-        method: Method = "svi" if has_function(model) or given.method != "map" else "map"
-        restarts = LAST_CASCADE_STARTS if isinstance(model, Cascade) else LAST_LINEAR_STARTS
+        method: Method = "svi" if model.has_function or given.method != "map" else "map"
+        restarts = LAST_LINEAR_STARTS if model.is_linear else LAST_CASCADE_STARTS
         return fit_model(
             model, record, method=method, start=given, restarts=restarts, seed=given.seed,
             workers=1, progress=False,

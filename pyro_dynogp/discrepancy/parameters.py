@@ -17,9 +17,8 @@ from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.methods.numbers import Number, number_posterior
 from pyro_dynogp.lti.views import steady_state_gain
 from pyro_dynogp.models.delays import where_inputs_are_known
-from pyro_dynogp.models.linear import LinearDynamicGP
-from pyro_dynogp.models.model import Cascade
-from pyro_dynogp.models.wiring import Dynamic, Static
+from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.wiring import Static
 
 if TYPE_CHECKING:
     from pyro_dynogp.inference.fitted import Fit
@@ -60,7 +59,7 @@ def limits_of(fit: Fit, evidence: Evidence, record: Record) -> Parameters:
     Posterior mean and standard deviation of the function [output] where it is best known of where
     it is at its limit to within a standard deviation; of the limits that the evidence has.
     """
-    if evidence.effect != "saturation" or not isinstance(fit.model, Cascade):
+    if evidence.effect != "saturation":
         return {}
     if not isinstance(fit.model.layers[-1], Static):
         return {}
@@ -100,9 +99,10 @@ def _weights(fit: Fit, channels: Sequence[Channel], drawn: Mapping[str, Tensor])
 def _gains(fit: Fit, channels: Sequence[Channel], drawn: Mapping[str, Tensor]) -> Parameters:
     """Of channels that act through the dynamics of a linear model, for constant inputs."""
     own = {name for one in channels if not one.direct for name in one.names}
-    if not own or not isinstance(fit.model, LinearDynamicGP):
+    if not own or not fit.model.is_linear:
         return {}
-    gains = steady_state_gain(fit._system_at(drawn).modes)[..., 0, :].numpy()
+    modes = fit.system_at(drawn).physical(fit.scaling).modes
+    gains = steady_state_gain(modes)[..., 0, :].numpy()
     scaling = fit.scaling
     return {
         _label(f"steady-state gain of {name}", _ratio(scaling.output_units[0], unit)): _moments(
@@ -174,9 +174,7 @@ def _step(channel: Channel, quantity: Quantity, record: Record) -> float:
     return 0.01 * float(np.std(channel.columns(record)))
 
 
-def _cell(
-    model: LinearDynamicGP | Cascade, channel: Channel, record: Record
-) -> tuple[float, float] | None:
+def _cell(model: Model, channel: Channel, record: Record) -> tuple[float, float] | None:
     """What times a whole number of samples stands for, of a dead time on an even clock.
 
     What arrives between two samples acts as what arrives with the second, through another numerator
@@ -187,11 +185,8 @@ def _cell(
     if not (isinstance(channel, Delayed) and record.is_regular):
         return None
     step = record.sampling_time
-    if isinstance(model, Cascade):
-        first = next((one for one in model.layers if isinstance(one, Dynamic)), None)
-        at_once = first is None or first.feedthrough
-    else:
-        at_once = model.feedthrough
+    first = next((layer for _, layer in model.dynamic), None)
+    at_once = first is None or first.feedthrough
     return (-step, 0.0) if at_once or channel.direct else (-0.5 * step, 0.5 * step)
 
 

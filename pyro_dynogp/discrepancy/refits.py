@@ -25,9 +25,7 @@ from pyro_dynogp.inference.starts.poles import (
     values_given_poles,
 )
 from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
-from pyro_dynogp.models.linear import LinearDynamicGP
-from pyro_dynogp.models.model import Cascade
-from pyro_dynogp.models.variants import Model, has_function
+from pyro_dynogp.models.model import Model
 from pyro_dynogp.support.checkpoints import NOTHING_KEPT
 
 # Iterations and fresh starts beside the warm one, of linear models and of cascades.
@@ -66,7 +64,7 @@ def quick_fit(
         ValueError: where the record does not fit the model, or a channel is constant.
     """
     scaled, records = _scaled(model, record)
-    if not isinstance(scaled, Cascade):
+    if scaled.is_linear:
         starts = starting_values(scaled, records, count=LINEAR_STARTS, seed=seed)
         starts += _warm_starts(scaled, records, seed, base, poles)
         optima = _linear(scaled, records, starts, LINEAR_STEPS, seed)
@@ -98,7 +96,7 @@ def race(
                 found.append(quick_fit(model, record, seed, base))
                 continue
             scaled, records = _scaled(model, record)
-            if isinstance(scaled, Cascade):
+            if not scaled.is_linear:
                 optima = _grown(scaled, records, seed, base, FIRST_STEPS, FIRST_STEPS // 3)
                 found.append(at_optimum(scaled, optima, seed, records))
             else:
@@ -109,12 +107,8 @@ def race(
     cut = max(FEWEST, round(LEADING * len(found)))
     begun = [one for one in found[:cut] if _begins(one.model, base)]
     rest = [one for one in found if not any(one is other for other in begun)]
-    further = [_further(one, seed) for one in begun if isinstance(one.model, Cascade)]
-    more = [
-        (one.model, one.records, [dict(one.mode)])
-        for one in begun
-        if not isinstance(one.model, Cascade)
-    ]
+    further = [_further(one, seed) for one in begun if not one.model.is_linear]
+    more = [(one.model, one.records, [dict(one.mode)]) for one in begun if one.model.is_linear]
     further += _side_by_side(more, MORE_STEPS, seed)
     return sorted([*further, *rest], key=energy), problems
 
@@ -126,9 +120,10 @@ def energy(fit: Fit) -> float:
 
 def poles_of(fit: Fit) -> np.ndarray | None:
     """Poles (P,) at the mode of a linear model [1/time unit]; None for a cascade."""
-    if isinstance(fit.model, Cascade):
+    if not fit.model.is_linear:
         return None
-    poles: np.ndarray = fit._system_at(fit.mode).modes.poles.numpy()
+    ((_, layer),) = fit.system_at(fit.mode).dynamic
+    poles: np.ndarray = layer.modes.poles.numpy()
     return poles
 
 
@@ -142,18 +137,8 @@ def _scaled(model: Model, record: Record) -> tuple[Model, tuple[Record, ...]]:
 
 
 def _begins(model: Model, base: Fit) -> bool:
-    """Whether a model begins where its base is: linear ones do, and cascades of the same layers.
-
-    A linear model is the same as a cascade of one dynamic layer.
-    """
-    if isinstance(model, Cascade):
-        return len(model.layers) == _count(base.model)
-    return not isinstance(base.model, Cascade)
-
-
-def _count(model: Model) -> int:
-    """Number of layers."""
-    return len(model.layers) if isinstance(model, Cascade) else 1
+    """Whether a model begins where its base is: it has the same layers."""
+    return len(model.layers) == len(base.model.layers)
 
 
 def _side_by_side(beginnings: Sequence[_Beginning], steps: int, seed: int) -> list[Fit]:
@@ -163,7 +148,8 @@ def _side_by_side(beginnings: Sequence[_Beginning], steps: int, seed: int) -> li
     together at each step.
     """
     potentials = [
-        Potential(model, (records[0],), starts[0]) for model, records, starts in beginnings
+        Potential(model.collapsed, (records[0],), starts[0])
+        for model, records, starts in beginnings
     ]
 
     def run(potential: Potential, starts: Sequence[Values]) -> Callable[[Functions], Optimum]:
@@ -197,20 +183,20 @@ def _further(found: Fit, seed: int) -> Fit:
 
 
 def _linear(
-    model: LinearDynamicGP,
+    model: Model,
     records: Sequence[Record],
     starts: Sequence[Values],
     steps: int,
     seed: int,
 ) -> list[Optimum]:
     return maximise(
-        model, records[0], starts, optimizer="preconditioned", steps=steps, seed=seed, workers=1,
-        together=TOGETHER, kept=KEPT,
+        model.collapsed, records[0], starts, optimizer="preconditioned", steps=steps, seed=seed,
+        workers=1, together=TOGETHER, kept=KEPT,
     )  # fmt: skip
 
 
 def _warm_starts(
-    model: LinearDynamicGP,
+    model: Model,
     records: Sequence[Record],
     seed: int,
     base: Fit | None,
@@ -223,9 +209,10 @@ def _warm_starts(
         poles = poles_of(base)
     if poles is not None:
         generator = np.random.default_rng(seed)
-        more = model.pairs - len(poles)
+        ((_, layer),) = model.dynamic
+        more = layer.pairs - len(poles)
         for _ in range(1 if more <= 0 else 3):
-            kept = poles[: model.pairs]
+            kept = poles[: layer.pairs]
             if more > 0:
                 fresh = random_poles(more, model.scaling, generator)
                 kept = np.concatenate([kept, fresh])
@@ -235,9 +222,9 @@ def _warm_starts(
     return starts
 
 
-def _fresh(model: Cascade, records: Sequence[Record], seed: int) -> list[Optimum]:
+def _fresh(model: Model, records: Sequence[Record], seed: int) -> list[Optimum]:
     """Without a function a cascade starts at its optimum but for the noise: one start is enough."""
-    count = CASCADE_STARTS if has_function(model) else 1
+    count = CASCADE_STARTS if model.has_function else 1
     target = model.collapsed
     starts = starting_points(target, records, count, LINEAR_STEPS, seed, 1, False, NOTHING_KEPT)
     return climb(
@@ -247,10 +234,11 @@ def _fresh(model: Cascade, records: Sequence[Record], seed: int) -> list[Optimum
 
 
 def _grown(
-    model: Cascade, records: Sequence[Record], seed: int, base: Fit, steps: int, filling: int
+    model: Model, records: Sequence[Record], seed: int, base: Fit, steps: int, filling: int
 ) -> list[Optimum]:
     """From what a cascade of the same layers has learnt; what it lacks is filled and silent."""
     target = model.collapsed
     (start,) = starting_points(target, records, 1, filling, seed, 1, False, NOTHING_KEPT)
-    learnt = grown(base.mode, start, silent=True)
+    assert model.scaling is not None
+    learnt = grown(base.mode, start, model.all_sites(model.scaling, len(records)))
     return grow(target, records[0], learnt, start, steps=steps, seed=seed)

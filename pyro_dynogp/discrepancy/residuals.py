@@ -12,7 +12,6 @@ from pyro_dynogp.data.channels import count_direct
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.models.delays import longest_delay, unknown_beginning
 from pyro_dynogp.models.limits import at_limits
-from pyro_dynogp.models.model import Cascade
 from pyro_dynogp.statistics.evidence import Residuals
 from pyro_dynogp.support.errors import invalid
 
@@ -54,13 +53,12 @@ def residuals_of(
                 "candidates", expected=f"extra channels {list(record.extra)}", got=repr(name)
             )
     prepared = fit.model.check(record)[0]
-    linear = not isinstance(fit.model, Cascade)
     if fit.method == "map":
         drawn = draws_of(fit, count=DRAWS, seed=seed, anneal=False)
         spread = with_draws(fit, drawn.values)
     else:
         spread = fit
-    options = {} if linear else {"process_noise": False}
+    options = {} if fit.model.is_linear else {"process_noise": False}
     mean = fit.simulate(prepared, seed=seed, **options).mean[:, output]
     component = spread.simulate(prepared, seed=seed, samples=DRAWS, **options).component_mean
     chosen = np.linspace(0, len(component) - 1, min(DRAWS, len(component))).astype(int)
@@ -70,9 +68,9 @@ def residuals_of(
     unknown = unknown_beginning(record, longest_delay(fit.model))
     y[: unknown + settling(fit, record)] = np.nan
     innovations = fit.innovations(prepared)[:, output]
-    if isinstance(fit.model, Cascade):  # a sensor at its limit says nothing of the error there
-        stopped = at_limits(fit.model.layers, prepared)
-        y[stopped], innovations = np.nan, np.where(stopped, np.nan, innovations)
+    # A sensor at its limit says nothing of the error there.
+    stopped = at_limits(fit.model.layers, prepared)
+    y[stopped], innovations = np.nan, np.where(stopped, np.nan, innovations)
     return Residuals(
         time=record.time,
         output=y,
@@ -93,9 +91,7 @@ def residuals_of(
 
 def settling(fit: Fit, record: Record) -> int:
     """Samples until what the first state left in a simulation has died away."""
-    system = fit._system_at(fit.mode)
-    layers = system.layers if isinstance(fit.model, Cascade) else [system]
-    modes = [layer.modes for layer in layers if hasattr(layer, "modes")]
+    modes = [layer.modes for _, layer in fit.system_at(fit.mode).dynamic]
     if not modes:
         return 0
     slowest = min(float(-one.poles.real.max()) for one in modes)

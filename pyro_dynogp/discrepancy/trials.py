@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from scipy.special import logsumexp
@@ -15,11 +15,9 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.refits import energy, poles_of, quick_fit, race
 from pyro_dynogp.inference.fitted import Fit
 from pyro_dynogp.models.delays import comparable
-from pyro_dynogp.models.model import Cascade
-from pyro_dynogp.models.outputs import collapsed_of
+from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.variants import Model
 from pyro_dynogp.prediction.first_state import beginning
-from pyro_dynogp.prediction.linear import prior_process
 
 # Blocks of a record on which effects of one instant are scored, every other one at a time.
 BLOCKS = 12
@@ -207,12 +205,8 @@ def forecast_errors(fit: Fit, record: Record, fold: np.ndarray) -> tuple[np.ndar
 def one_step_density(fit: Fit, record: Record) -> np.ndarray:
     """Log-density (n, n_y) of each output given the outputs before it, NaN where missing."""
     prepared = fit.model.check(record)[0]
-    observed: Any
-    if isinstance(fit.model, Cascade):
-        observed = collapsed_of(beginning(fit, prepared), fit.scaling, prepared)
-    else:
-        observed = prior_process(fit, prepared, unknown_start=True).observed(fit.system.noise_sd)
-    each = pointwise_log_density(observed, prepared.tensors().observations, "forecast")
+    outputs = output_process(beginning(fit, prepared, predicting=True), fit.scaling, prepared)
+    each = pointwise_log_density(outputs, prepared.tensors().observations, "forecast")
     return logsumexp(each, axis=0) - np.log(len(each))
 
 

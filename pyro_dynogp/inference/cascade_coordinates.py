@@ -34,7 +34,7 @@ from pyro_dynogp.inference.cascade_coordinate_steps import (
 )
 from pyro_dynogp.inference.density import Potential, Site, parts
 from pyro_dynogp.layers.functions import StaticFunction
-from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.wiring import Dynamic, Static, Wire
 
 # Directions of v of which the data say less than this share of what its prior says count as unseen.
@@ -46,7 +46,7 @@ class StraightPotential(Potential):
 
     nearly_normal = True
 
-    def __init__(self, model: Cascade, args: tuple[Any, ...], values: Mapping[str, Tensor]) -> None:
+    def __init__(self, model: Model, args: tuple[Any, ...], values: Mapping[str, Tensor]) -> None:
         super().__init__(model, args, values)
         self.steps = steps_of(model, Potential(model, args, values))
 
@@ -89,12 +89,12 @@ def potential_for_sampling(
     model: Any, args: tuple[Any, ...], values: Mapping[str, Tensor]
 ) -> Potential:
     """The potential of a model in the coordinates that chains are best run in."""
-    if isinstance(model, Cascade) and model.integrate == "all":
+    if isinstance(model, Model) and model.has_function and model.integrate == "all":
         return StraightPotential(model, args, values)
     return Potential(model, args, values)
 
 
-def steps_of(model: Cascade, plain: Potential) -> list[Step]:
+def steps_of(model: Model, plain: Potential) -> list[Step]:
     """The changes of coordinates that a cascade's layers ask for, in the order of `forward`."""
     named = {site.name: site for site in plain.sites}
     sizes: dict[str, RelativeToGain] = {}
@@ -152,7 +152,7 @@ def _is_exponential(site: Site) -> bool:
 
 
 def _layer(
-    model: Cascade, one: Wire, layer: Static, plain: Potential, relative: RelativeToGain | None
+    model: Model, one: Wire, layer: Static, plain: Potential, relative: RelativeToGain | None
 ) -> Layer:
     """A static function as the unconstrained values of all sites have it, and where it is seen.
 
@@ -162,7 +162,7 @@ def _layer(
 
     def function(z: Parts) -> StaticFunction:
         given = {site.name: site.transform(z[site.name]) for site in own}
-        return model.static_given(one, layer, given)
+        return model.static_function(one, layer, given)
 
     start = by_name(plain.sites, plain.pack(plain.at))
     fixed = function(start).locations.detach()

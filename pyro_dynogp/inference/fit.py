@@ -22,8 +22,7 @@ from pyro_dynogp.inference.methods.trajectories import fit_layered
 from pyro_dynogp.inference.optimise.maximum import Optimizer, Optimum, maximise
 from pyro_dynogp.inference.posteriors import Guide
 from pyro_dynogp.inference.starts.poles import grown, starting_values
-from pyro_dynogp.models.linear import LinearDynamicGP
-from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.models.model import Model
 from pyro_dynogp.support.checkpoints import Checkpoints
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.parallel import seeded
@@ -35,7 +34,7 @@ POLISH = 60
 
 
 def fit(
-    model: LinearDynamicGP | Cascade,
+    model: Model,
     record: Record | Sequence[Record],
     *,
     method: Method | None = None,
@@ -103,7 +102,7 @@ def fit(
         ValueError: on channels that do not fit the model, constant or entirely missing outputs,
             unknown options, or where no start leads anywhere.
     """
-    cascade = isinstance(model, Cascade)
+    cascade = model.has_function
     if method is None:
         method = "svi" if cascade else "map"
     if method not in ("map", "svi", "nuts"):
@@ -126,13 +125,9 @@ def fit(
             expected="'map', 'normal' or 'multivariate normal'",
             got=repr(hyperparameters),
         )
-    if guide is not None and not cascade:
+    if guide is not None and model.is_linear and model.likelihood.gaussian:
         raise invalid("guide", expected="None for a linear model, which is exact", got=repr(guide))
-    if start is not None and isinstance(start.model, Cascade) != cascade:
-        kind = "a cascade" if cascade else "a linear model"
-        got = type(start.model).__name__
-        raise invalid("start", expected=f"a fit of {kind}", got=f"one of {got}")
-    if start is not None and cascade and guide not in (None, "collapsed"):
+    if start is not None and guide not in (None, "collapsed"):
         raise invalid("start", expected="None with this guide", got="a fit")
     learnt = None if start is None else dict(start.mode)
     records = model.check(record)
@@ -148,7 +143,7 @@ def fit(
         (seed, restarts, steps, optimizer, draws, chains, warmup, particles, learning_rate),
         *([] if learnt is None else [{name: v.tolist() for name, v in learnt.items()}]),
     )
-    if isinstance(model, Cascade) and guide not in (None, "collapsed"):
+    if guide not in (None, "collapsed"):
         if method != "svi":
             raise invalid("method", expected="'svi' with this guide", got=repr(method))
         return fit_layered(
@@ -165,20 +160,19 @@ def fit(
             workers=workers,
             progress=progress,
         )
-    if isinstance(model, Cascade):
-        target: Any = model.collapsed
+    target = model.collapsed
+    if not model.is_linear:
         optima = best_optima(
             target, records, restarts, steps or 600, optimizer, seed, workers, progress, kept,
             learnt,
         )  # fmt: skip
     else:
-        target = model
         climb = steps if steps is not None and method == "map" else None
         starts = starting_values(model, records, count=restarts, seed=seed)
         if learnt is not None:
             starts = [grown(learnt, starts[0]), *starts]
         optima = maximise(
-            model,
+            target,
             argument,
             starts,
             optimizer=optimizer,

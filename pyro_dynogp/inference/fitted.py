@@ -24,12 +24,11 @@ from pyro_dynogp.inference.posteriors import (
     PointGuide,
 )
 from pyro_dynogp.lti.modes import Modes
-from pyro_dynogp.models.linear import LinearDynamicGP
-from pyro_dynogp.models.model import Cascade
-from pyro_dynogp.models.outputs import collapsed_of
+from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.outputs import output_process
+from pyro_dynogp.models.system import System
 from pyro_dynogp.prediction import layers as _layers
-from pyro_dynogp.prediction import linear as _linear
-from pyro_dynogp.prediction import predict as _cascade
+from pyro_dynogp.prediction import predict as _predict
 from pyro_dynogp.prediction.first_state import beginning
 from pyro_dynogp.prediction.layers import LayerTrajectory, StaticBand
 from pyro_dynogp.prediction.prediction import Prediction
@@ -61,7 +60,7 @@ class Fit:
             where the guide had trajectories as sites [nats].
     """
 
-    model: LinearDynamicGP | Cascade
+    model: Model
     method: Method
     draws: Mapping[str, Tensor]
     mode: Mapping[str, Tensor]
@@ -99,47 +98,34 @@ class Fit:
         return DrawsGuide(dict(self.draws)) if self.posterior is None else self.posterior
 
     @cached_property
-    def system(self) -> Any:
-        """All parameters, batch (S,) of draws: a `LinearSystem` or a `CascadeSystem`."""
-        return self._system_at(self.draws)
+    def system(self) -> System:
+        """All parameters, batch (S,) of draws, in units of the scaled record."""
+        return self.system_at(self.draws)
 
-    def _system_at(self, values: Mapping[str, Tensor]) -> Any:
-        model = self.model.collapsed  # parameters alone, no trajectories
-        sample = pyro.poutine.condition(model.sample_system, data=dict(values))
-        with torch.no_grad(), pyro.poutine.block():
-            return sample(self.scaling)
-
-    @property
-    def _predictions(self) -> Any:
-        return _cascade if isinstance(self.model, Cascade) else _linear
+    def system_at(self, values: Mapping[str, Tensor]) -> System:
+        """All parameters at values of the sites."""
+        with torch.no_grad():
+            return self.model.collapsed.system(values, self.scaling)
 
     @property
     def modes(self) -> Modes:
         """Poles and gains in the units of the record; batch (S,) of draws, none for "map".
 
-        Of a linear model; those of a cascade's layer g are `system.layer("g").modes`.
+        Of a model of one layer; those of a layer g of others are `system.layer("g").modes`.
+
+        Raises:
+            ValueError: for a model of several layers, or of a static one.
         """
-        if isinstance(self.model, Cascade):
-            raise invalid(
-                "modes",
-                expected="a LinearDynamicGP",
-                got="a Cascade, whose layers have modes of their own",
-                advice='Use fit.system.layer("g").modes.',
-            )
-        modes: Modes = self.system.modes
+        modes = self.system.physical(self.scaling).modes
         return modes[0] if self.method == "map" else modes
 
     @property
     def noise_sd(self) -> np.ndarray:
         """Posterior mean of the measurement noise's scale (n_y,) [output]."""
-        if isinstance(self.model, Cascade):
-            sd = self.system.noise.constant_sd
-            if sd is None:
-                raise invalid(
-                    "noise_sd", expected="noise of constant scale", got="noise that varies"
-                )
-            return self.scaling.output_scale * sd.mean(0).numpy()
-        return np.atleast_1d(self.system.noise_sd.mean(0).numpy())
+        sd = self.system.noise.constant_sd
+        if sd is None:
+            raise invalid("noise_sd", expected="noise of constant scale", got="noise that varies")
+        return self.scaling.output_scale * sd.mean(0).numpy()
 
     @property
     def elbo(self) -> np.ndarray:
@@ -159,10 +145,9 @@ class Fit:
     def layers(self, record: Record) -> Mapping[str, LayerTrajectory]:
         """Posterior trajectories of all layers along a record, given its inputs and outputs.
 
-        Of a cascade: by the smoother of the moment-matching filter. A record without outputs
-        gives the trajectories that the inputs alone say.
+        Exactly for linear models, by the smoother of the moment-matching filter for others. A
+        record without outputs gives the trajectories that the inputs alone say.
         """
-        self._only_cascade("layers")
         return _layers.layers(self, record)
 
     def static_function(
@@ -174,18 +159,7 @@ class Fit:
             name: of the layer. record: says over which range, and where data are.
             channel: the input that varies, others at their mean. points: number of points.
         """
-        self._only_cascade("static_function")
         return _layers.static_function(self, name, record, channel, points)
-
-    def _only_cascade(self, what: str) -> None:
-        if not isinstance(self.model, Cascade):
-            raise invalid(
-                what,
-                expected="a fitted Cascade",
-                got=type(self.model).__name__,
-                advice="A linear model has one trajectory and no static function: use simulate, "
-                "predict or forecast.",
-            )
 
     def log_joint(self, records: Record | Sequence[Record]) -> float:
         """Log p(y, mode): of the records with the sites at the mode."""
@@ -195,19 +169,11 @@ class Fit:
 
     def log_likelihood(self, records: Record | Sequence[Record]) -> np.ndarray:
         """Log p(y | draw) (S,) [nats], exact marginal likelihood in the units of the record."""
-        checked = self.model.check(records)
         total: Any = 0.0
         with torch.no_grad():
-            if isinstance(self.model, Cascade):
-                for record in checked:
-                    system = beginning(self, record)
-                    y = record.tensors().observations
-                    total = total + collapsed_of(system, self.scaling, record).log_prob(y)
-                return total.numpy()
-            for record in checked:
-                process = _linear.prior_process(self, record)
-                y = record.tensors().observations
-                total = total + process.observed(self.system.noise_sd).log_prob(y)
+            for record in self.model.check(records):
+                outputs = output_process(beginning(self, record), self.scaling, record)
+                total = total + outputs.log_prob(record.tensors().observations)
         return total.numpy()
 
     def simulate(
@@ -220,7 +186,7 @@ class Fit:
             process_noise: False for the response of the deterministic system.
             samples: number of joint samples that `Prediction.samples` draws. seed: for these.
         """
-        return self._predictions.simulate(self, record, process_noise, samples, seed)
+        return _predict.simulate(self, record, process_noise, samples, seed)
 
     def predict(
         self, record: Record, *, horizon: int = 1, samples: int = 200, seed: int = 0
@@ -231,7 +197,7 @@ class Fit:
         joint law over time (a moving average of `horizon` innovations on a regular record); those
         of a cascade are independent from time to time.
         """
-        return self._predictions.predict(self, record, horizon, samples, seed)
+        return _predict.predict(self, record, horizon, samples, seed)
 
     def forecast(
         self,
@@ -249,7 +215,7 @@ class Fit:
             process_noise: False if the future is known to have none.
             samples: number of joint samples. seed: for these.
         """
-        return self._predictions.forecast(self, past, future, process_noise, samples, seed)
+        return _predict.forecast(self, past, future, process_noise, samples, seed)
 
     def innovations(self, record: Record) -> np.ndarray:
         """Standardised one-step prediction errors (n, n_y); NaN where the output is missing.

@@ -17,7 +17,6 @@ from pyro_dynogp.inference.methods.nuts import sample_posterior
 from pyro_dynogp.inference.methods.optima import Hyperparameters, posterior_of
 from pyro_dynogp.inference.optimise.maximum import Optimum, maximise
 from pyro_dynogp.inference.posteriors import GaussianGuide, MixtureGuide
-from pyro_dynogp.models.model import Cascade
 from pyro_dynogp.support.checkpoints import NOTHING_KEPT
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.parallel import seeded
@@ -54,7 +53,7 @@ def refit(fit: Fit, records: Record | Sequence[Record]) -> Fit:
         raise invalid("records", expected=f"{len(fit.records)}, as before", got=str(len(several)))
     target: Any = fit.model.collapsed
     argument = several[0] if len(several) == 1 else several
-    cascade = isinstance(fit.model, Cascade)
+    cascade = fit.model.has_function
     optima = maximise(
         target,
         argument,

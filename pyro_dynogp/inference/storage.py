@@ -23,8 +23,7 @@ from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.posteriors import GaussianGuide, MixtureGuide
 from pyro_dynogp.layers.noise import Likelihood
-from pyro_dynogp.models.linear import LinearDynamicGP
-from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.wiring import Dynamic, Layer, Static
 from pyro_dynogp.support.errors import invalid
 
@@ -34,7 +33,7 @@ if TYPE_CHECKING:
 FORMAT = "pyro_dynogp.fit"
 VERSION = 4
 # The models that a file may name: a file never decides what code is run.
-MODELS = {"Cascade": Cascade, "LinearDynamicGP": LinearDynamicGP}
+MODELS = ("Model", "Cascade", "LinearDynamicGP")
 LAYERS: dict[str, type[Dynamic] | type[Static]] = {"Dynamic": Dynamic, "Static": Static}
 
 
@@ -126,39 +125,41 @@ def load(path: str | Path) -> Fit:
         raise ValueError(f"load: {path} is incomplete or damaged ({error}).") from error
 
 
-def _options(model: LinearDynamicGP | Cascade) -> dict[str, Any]:
+def _options(model: Model) -> dict[str, Any]:
     """Everything that a model is made with but its scaling, as JSON has it."""
     options = {f.name: getattr(model, f.name) for f in fields(model) if f.name != "scaling"}
     options["channels"] = [to_plain(channel) for channel in model.channels]
-    if isinstance(model, Cascade):
-        for one in model.wires:
-            if isinstance(one.layer, Static) and one.layer.kernel is not None:
-                raise invalid(
-                    "save",
-                    expected="layers with the default kernel (kernel=None)",
-                    got=f"{type(one.layer.kernel).__name__} in layer {one.name!r}",
-                    advice="A file holds numbers alone, no kernel of gpytorch: keep fit.draws and "
-                    "the code that makes the model.",
-                )
-        options["layers"] = [
-            {
-                "kind": type(layer).__name__,
-                **{f.name: getattr(layer, f.name) for f in fields(layer)},
-            }
-            for layer in model.layers
-        ]
-        options["likelihood"] = asdict(model.likelihood)
+    for wire in model.wires:
+        if isinstance(wire.layer, Static) and wire.layer.kernel is not None:
+            raise invalid(
+                "save",
+                expected="layers with the default kernel (kernel=None)",
+                got=f"{type(wire.layer.kernel).__name__} in layer {wire.name!r}",
+                advice="A file holds numbers alone, no kernel of gpytorch: keep fit.draws and "
+                "the code that makes the model.",
+            )
+    options["layers"] = [
+        {"kind": type(layer).__name__, **{f.name: getattr(layer, f.name) for f in fields(layer)}}
+        for layer in model.layers
+    ]
+    options["likelihood"] = asdict(model.likelihood)
     return options
 
 
-def _model(name: str, options: Mapping[str, Any], scaling: Scaling) -> LinearDynamicGP | Cascade:
+def _model(name: str, options: Mapping[str, Any], scaling: Scaling) -> Model:
     """Inverse of `_options`."""
     given = dict(options)
     given["channels"] = tuple(from_plain(plain) for plain in given["channels"])
-    if name == "Cascade":
+    if name == "LinearDynamicGP":  # of version 4: one layer of dynamics
+        own = ("outputs", "pairs", "noise", "brownian", "feedthrough", "process_noise")
+        given["layers"] = (Dynamic(**{option: given.pop(option) for option in own}),)
+        given["integrate"] = "all"
+    else:
         given["layers"] = tuple(_layer(layer) for layer in given["layers"])
         given["likelihood"] = Likelihood(**given["likelihood"])
-    return MODELS[name](**given, scaling=scaling)
+        if name == "Cascade" and given["initial_state"] == "site":  # what version 4 called "auto"
+            given["initial_state"] = "auto"
+    return Model(**given, scaling=scaling)
 
 
 def _layer(options: Mapping[str, Any]) -> Layer:
@@ -237,7 +238,7 @@ def _record(labels: Mapping[str, Any], tensors: Mapping[str, Tensor], key: str) 
 
 
 def _sites(
-    model: LinearDynamicGP | Cascade,
+    model: Model,
     scaling: Scaling,
     mode: Mapping[str, Tensor],
     points: Mapping[str, Tensor],

@@ -6,8 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from pyro_dynogp.models.model import Cascade
-from pyro_dynogp.models.system import DynamicSystem
 from pyro_dynogp.models.wiring import Dynamic
 
 if TYPE_CHECKING:
@@ -16,28 +14,20 @@ if TYPE_CHECKING:
 
 def summary(fit: Fit) -> str:
     """What was fitted, how well it went, the modes at the best optimum."""
-    system = fit._system_at(fit.mode)
+    system = fit.system_at(fit.mode)
     model = fit.model
-    if isinstance(model, Cascade):
-        chain = " -> ".join(f"{one.name} ({_describe(one.layer)})" for one in model.wires)
-        lines = [f"Cascade of {model.inputs} inputs: {chain}"]
-    else:
-        lines = [
-            f"{type(model).__name__} with pairs={model.pairs}, "
-            f"inputs={model.inputs}, outputs={model.outputs}"
-        ]
+    chain = " -> ".join(f"{wire.name} ({_describe(wire.layer)})" for wire in model.wires)
+    plural = "s" if model.inputs != 1 else ""
+    lines = [f"{model.inputs} input{plural} -> {chain}"]
     lines[0] += f"; method {fit.method!r}, seed {fit.seed}"
     energies = ", ".join(f"{e:.1f}" for e in fit.start_energies[:6])
     lines.append(f"-log p(y, values) of the starts: {energies}")
     unit = fit.scaling.time_unit
-    if isinstance(model, Cascade):
-        for one, layer in zip(system.wires, system.layers, strict=True):
-            if isinstance(layer, DynamicSystem):
-                lines.append(f"layer {one.name}:")
-                lines.extend(_modes(layer.modes, unit))
-    else:
-        lines.extend(_modes(system.modes, unit))
-    if not isinstance(model, Cascade) or not model.likelihood.varying:
+    for wire, layer in system.dynamic:
+        if len(model.wires) > 1:
+            lines.append(f"layer {wire.name}:")
+        lines.extend(_modes(layer.modes, unit))
+    if not model.likelihood.varying:
         sd = ", ".join(f"{value:.4g}" for value in fit.noise_sd)
         lines.append(f"measurement noise sd: {sd}")
     return "\n".join(lines)

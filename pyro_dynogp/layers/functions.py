@@ -204,3 +204,20 @@ def even_grid(low: Tensor, high: Tensor, count: int) -> Tensor:
     """Even grid (*b, count) from low (*b) to high (*b)."""
     share = torch.linspace(0.0, 1.0, count, dtype=torch.float64, device=low.device)
     return low.unsqueeze(-1) + (high - low).unsqueeze(-1) * share
+
+
+def support_points(locations: Tensor, count: int) -> Tensor:
+    """Points (*b, K, d) at which the rest of a function is drawn: over where inducing points lie.
+
+    One channel: an even grid. Several: the inducing locations spread by a Sobol sequence over
+    their box. No gradient passes.
+    """
+    z = locations.detach()
+    low, high = z.amin(-2, keepdim=True), z.amax(-2, keepdim=True)
+    margin = 0.1 * (high - low) + 1e-3
+    if z.shape[-1] == 1:
+        unit = torch.linspace(0.0, 1.0, count, dtype=torch.float64).unsqueeze(-1)
+    else:
+        engine = torch.quasirandom.SobolEngine(z.shape[-1])
+        unit = engine.draw(count, dtype=torch.float64)
+    return low - margin + (high - low + 2.0 * margin) * unit

@@ -12,9 +12,8 @@ import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
-import pyro
 import pyro.distributions as dist
 import torch
 from gpytorch import constraints, kernels
@@ -23,6 +22,7 @@ from torch import Tensor
 
 from pyro_dynogp.layers.hyperpriors import hyperprior, meaning, plain_name
 from pyro_dynogp.layers.radial import check_lengthscale, function_of_distance
+from pyro_dynogp.layers.sites import Site, sample
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.tensors import broadcast
 
@@ -206,8 +206,9 @@ def _default_form(channels: int) -> kernels.Kernel:
     return kernels.MaternKernel(1.5, ard_num_dims=channels).double().requires_grad_(False)
 
 
-def sample_kernel(name: str, kernel: kernels.Kernel | None, channels: int) -> SampledKernel:
-    """Sample the hyperparameters of a kernel.
+@dataclass(frozen=True, eq=False)
+class KernelPrior:
+    """Prior of the hyperparameters of a kernel: its sites, and the kernel at their values.
 
     Sites: for None, which stands for a Matern-3/2 kernel of unit variance, ``<name>_lengthscale``
     (d,), LogNormal(0, 1). For a GPyTorch kernel ``<name>_<parameter>`` with the shape of the
@@ -216,50 +217,93 @@ def sample_kernel(name: str, kernel: kernels.Kernel | None, channels: int) -> Sa
     constraint), its distribution the prior registered with the kernel, or else one around the
     present value, see `hyperprior`.
 
-    Args:
+    Attributes:
         name: prefix of the sites.
         kernel: a GPyTorch kernel without batch shape, copied, never changed; or None.
         channels: d, number of channels of the points.
 
-    Returns:
-        The kernel, with the batch shape of the sites (particles).
-
     Raises:
         ValueError: if `kernel` is something else or has a prior that cannot be a site's.
     """
-    if kernel is None:
-        zero = torch.zeros(channels, dtype=torch.float64)
-        lengthscale = pyro.sample(f"{name}_lengthscale", dist.LogNormal(zero, 1.0).to_event(1))
-        form = _default_form(channels)
-        return SampledKernel(form, {"raw_lengthscale": lengthscale.unsqueeze(-2)}, channels)
-    if not isinstance(kernel, kernels.Kernel):
-        raise invalid("kernel", expected="a gpytorch kernel or None", got=type(kernel).__name__)
-    if kernel.batch_shape:
-        raise invalid(
-            "kernel",
-            expected="a kernel without batch shape",
-            got=f"batch shape {tuple(kernel.batch_shape)}",
-            advice="Batch dimensions come from the plates around the layer.",
-        )
-    form = copy.deepcopy(kernel).double()
-    names = {plain_name(parameter) + "_prior" for parameter, _ in form.named_parameters()}
-    stray = {prior for prior, *_ in form.named_priors()} - names
-    if stray:
-        raise invalid(
-            "kernel",
-            expected="each prior named after its parameter ('lengthscale_prior')",
-            got=", ".join(sorted(stray)),
-        )
-    values = {}
-    for parameter, raw in form.named_parameters():
-        if raw.requires_grad:
-            site = f"{name}_{plain_name(parameter).replace('.', '_')}"
-            values[parameter] = pyro.sample(site, hyperprior(form, parameter))
-        else:
-            values[parameter] = meaning(form, parameter)
-    form.requires_grad_(False)
-    _drop_constraints(form)
-    return SampledKernel(form, values, channels)
+
+    name: str
+    kernel: kernels.Kernel | None
+    channels: int
+
+    def __post_init__(self) -> None:
+        if self.kernel is None:
+            return
+        if not isinstance(self.kernel, kernels.Kernel):
+            got = type(self.kernel).__name__
+            raise invalid("kernel", expected="a gpytorch kernel or None", got=got)
+        if self.kernel.batch_shape:
+            raise invalid(
+                "kernel",
+                expected="a kernel without batch shape",
+                got=f"batch shape {tuple(self.kernel.batch_shape)}",
+                advice="Batch dimensions come from the plates around the layer.",
+            )
+        names = {plain_name(parameter) + "_prior" for parameter, _ in self._form.named_parameters()}
+        stray = {prior for prior, *_ in self._form.named_priors()} - names
+        if stray:
+            raise invalid(
+                "kernel",
+                expected="each prior named after its parameter ('lengthscale_prior')",
+                got=", ".join(sorted(stray)),
+            )
+
+    @cached_property
+    def _form(self) -> kernels.Kernel:
+        assert self.kernel is not None
+        return copy.deepcopy(self.kernel).double()
+
+    @cached_property
+    def _free(self) -> kernels.Kernel:
+        """A copy whose parameters are what they mean, so that nothing has to be inverted."""
+        form = copy.deepcopy(self._form)
+        form.requires_grad_(False)
+        _drop_constraints(form)
+        return form
+
+    def _site(self, parameter: str) -> str:
+        return f"{self.name}_{plain_name(parameter).replace('.', '_')}"
+
+    def sites(self, inputs: str = "input") -> tuple[Site, ...]:
+        """The sites; `inputs` is the name of the dimension of the default kernel's lengthscales.
+
+        Parameters of a GPyTorch kernel number their dimensions, as ArviZ does.
+        """
+        if self.kernel is None:
+            zero = torch.zeros(self.channels, dtype=torch.float64)
+            prior = dist.LogNormal(zero, 1.0).to_event(1)
+            return (Site(f"{self.name}_lengthscale", prior, (inputs,)),)
+        sites = []
+        for parameter, raw in self._form.named_parameters():
+            if raw.requires_grad:
+                prior, name = hyperprior(self._form, parameter), self._site(parameter)
+                dims = tuple(f"{name}_dim_{axis}" for axis in range(len(prior.event_shape)))
+                sites.append(Site(name, prior, dims))
+        return tuple(sites)
+
+    def sampled(self, values: Mapping[str, Tensor]) -> SampledKernel:
+        """The kernel at values (*b, *shape) of the sites; batch shape *b."""
+        if self.kernel is None:
+            lengthscale = values[f"{self.name}_lengthscale"].unsqueeze(-2)
+            form = _default_form(self.channels)
+            return SampledKernel(form, {"raw_lengthscale": lengthscale}, self.channels)
+        given = {
+            parameter: values[self._site(parameter)]
+            if raw.requires_grad
+            else meaning(self._form, parameter)
+            for parameter, raw in self._form.named_parameters()
+        }
+        return SampledKernel(self._free, given, self.channels)
+
+
+def sample_kernel(name: str, kernel: kernels.Kernel | None, channels: int) -> SampledKernel:
+    """Sample the hyperparameters of a kernel; args and sites as those of `KernelPrior`."""
+    prior = KernelPrior(name, kernel, channels)
+    return prior.sampled(sample(prior.sites()))
 
 
 def _drop_constraints(kernel: kernels.Kernel) -> None:

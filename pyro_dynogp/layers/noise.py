@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-import pyro
 import pyro.distributions as dist
 import torch
 from scipy.special import gammainc, gammaincinv
 from torch import Tensor
 
 from pyro_dynogp.layers.functions import StaticFunction
-from pyro_dynogp.layers.static import sample_static
+from pyro_dynogp.layers.sites import Site, Values
+from pyro_dynogp.layers.static import StaticPrior
 from pyro_dynogp.support.errors import invalid
 
 # What varying noise is a function of.
@@ -60,31 +60,39 @@ class Likelihood:
         """Whether the noise is Gaussian."""
         return self.degrees_of_freedom is None
 
-    def sample(self, outputs: int, inputs: int, *, flat: bool = False) -> Noise:
-        """Sample its parameters.
+    def sites(self, outputs: int, inputs: int, *, flat: bool = False) -> tuple[Site, ...]:
+        """The sites of the noise of a model with so many outputs and inputs that drive it.
 
-        Sites: ``noise_sd`` (n_y,), log-normal around a tenth of the output's standard deviation;
-        with `varying`, ``log_noise_...`` instead, those of a static layer of what drives it, which
+        ``noise_sd`` (n_y,), log-normal around a tenth of the output's standard deviation; with
+        `varying`, ``log_noise_...`` instead, those of a static layer of what drives it, which
         gives log(sd / 0.1).
+
+        Raises:
+            ValueError: for noise that varies in a model without inputs.
         """
         if self.varying:
-            if not inputs:
-                raise invalid(
-                    "likelihood",
-                    expected="constant noise for a model without inputs",
-                    got=f"noise that varies with the {self.of}",
-                )
-            channels = inputs if self.of == "inputs" else outputs
-            function = sample_static(
-                "log_noise", channels=channels, outputs=outputs, inducing=self.inducing
-            )
-            return Noise(self, None, function)
+            driver = "input" if self.of == "inputs" else "output"
+            dims = {"input": driver, "inducing": "log_noise_inducing"}
+            return self._function(outputs, inputs).sites(dims)
         zero = torch.zeros(outputs, dtype=torch.float64)
-        spread = FLAT if flat else 1.5
-        sd = pyro.sample(
-            "noise_sd", dist.LogNormal(zero + math.log(TYPICAL), zero + spread).to_event(1)
-        )
-        return Noise(self, sd, None)
+        prior = dist.LogNormal(zero + math.log(TYPICAL), zero + (FLAT if flat else 1.5))
+        return (Site("noise_sd", prior.to_event(1), ("output",)),)
+
+    def noise(self, values: Values, outputs: int, inputs: int) -> Noise:
+        """The noise at values (*b, *shape) of its sites."""
+        if self.varying:
+            return Noise(self, None, self._function(outputs, inputs).function(values))
+        return Noise(self, values["noise_sd"], None)
+
+    def _function(self, outputs: int, inputs: int) -> StaticPrior:
+        if not inputs:
+            raise invalid(
+                "likelihood",
+                expected="constant noise for a model without inputs",
+                got=f"noise that varies with the {self.of}",
+            )
+        channels = inputs if self.of == "inputs" else outputs
+        return StaticPrior("log_noise", channels, outputs, self.inducing)
 
     def components(self) -> tuple[np.ndarray, np.ndarray]:
         """Shares and variance multiples (K,) of the Gaussian mixture: one component if Gaussian."""

@@ -9,6 +9,10 @@ lengthscales and locations say so.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from types import MappingProxyType
 from typing import Any, Literal
 
 import gpytorch
@@ -18,11 +22,13 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.layers.functions import JITTER, StaticFunction, even_grid
-from pyro_dynogp.layers.kernels import sample_kernel
+from pyro_dynogp.layers.kernels import KernelPrior
+from pyro_dynogp.layers.sites import Site, Values, normal, sample
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.tensors import as_tensor
 
 MeanName = Literal["constant", "linear"]
+NO_NAMES: Mapping[str, str] = MappingProxyType({})
 
 # Half the width of the starting grid of one channel of unit standard deviation.
 REACH = 3.0
@@ -42,6 +48,118 @@ def starting_locations(inducing: int, channels: int) -> Tensor:
     return torch.special.ndtri(sobol.draw(inducing, dtype=torch.float64))
 
 
+@dataclass(frozen=True, eq=False)
+class StaticPrior:
+    """Prior of a static function of inputs of unit scale.
+
+    It lists the sites and maps their values to a `StaticFunction`. Sites (all start with
+    ``<name>_``), * marking what depends on the options:
+
+    - the kernel's, see `kernel_sites`; by default ``lengthscale`` (d,), LogNormal(0, 1).
+    - ``output_scale`` (e,): LogNormal(0, 1).
+    - ``constant`` (e,): normal(0, 1).
+    - ``slope`` (e, d)*: normal(identity where e = d, else zero; 1).
+    - one channel: ``center`` (1,)*, normal(0, 1), and ``half_width`` (1,)*, LogNormal(log 3, 0.5),
+      of the even grid of locations; several channels, or `locations` given: ``locations`` (M, d)*,
+      normal(starting locations, 1).
+    - ``values`` (e, M): standard normal, the whitened inducing values.
+
+    Attributes:
+        name: prefix of the sites.
+        channels: d, number of inputs. outputs: e.
+        inducing: M, number of inducing locations, where `locations` does not say.
+        kernel: a GPyTorch kernel (of unit variance: `output_scale` multiplies it); None for a
+            Matern-3/2 with a lengthscale for each channel.
+        mean: "constant", or "linear" for a slope as well.
+        learn_locations: whether the locations are learnt; else they stay at the start.
+        locations: starting locations (M, d), or (M,) for one channel; by default
+            `starting_locations`.
+
+    Raises:
+        ValueError: if an option or shape is wrong.
+    """
+
+    name: str
+    channels: int
+    outputs: int
+    inducing: int = 32
+    kernel: gpytorch.kernels.Kernel | None = None
+    mean: MeanName = "constant"
+    learn_locations: bool = True
+    locations: Any = None
+
+    def __post_init__(self) -> None:
+        _check_counts(channels=self.channels, outputs=self.outputs, inducing=self.inducing)
+        if self.mean not in ("constant", "linear"):
+            raise invalid("mean", expected="'constant' or 'linear'", got=repr(self.mean))
+
+    @cached_property
+    def start(self) -> Tensor:
+        """Starting locations (M, d)."""
+        if self.locations is None:
+            return starting_locations(self.inducing, self.channels)
+        return _points("locations", self.locations, self.channels)
+
+    @property
+    def _even(self) -> bool:
+        """Whether two numbers move an even grid: free locations of one channel trade places."""
+        return self.learn_locations and self.channels == 1 and self.locations is None
+
+    @cached_property
+    def kernel_prior(self) -> KernelPrior:
+        """Of the kernel's parameters."""
+        return KernelPrior(self.name, self.kernel, self.channels)
+
+    def sites(self, dims: Mapping[str, str] = NO_NAMES) -> tuple[Site, ...]:
+        """The sites, in the order in which they are sampled.
+
+        Args:
+            dims: names of dimensions ("input", "output", "inducing") where they are others.
+        """
+        inputs, outputs = dims.get("input", "input"), dims.get("output", "output")
+        inducing = dims.get("inducing", "inducing")
+        zero = torch.zeros(self.outputs, dtype=torch.float64)
+        name, Z = self.name, self.start
+        sites = [
+            *self.kernel_prior.sites(inputs),
+            Site(f"{name}_output_scale", dist.LogNormal(zero, 1.0).to_event(1), (outputs,)),
+            normal(f"{name}_constant", zero, (outputs,)),
+        ]
+        if self.mean == "linear":
+            start = torch.zeros(self.outputs, self.channels, dtype=torch.float64)
+            if self.outputs == self.channels:
+                start.fill_diagonal_(1.0)
+            sites.append(normal(f"{name}_slope", start, (outputs, inputs)))
+        if self._even:
+            one = torch.ones(1, dtype=torch.float64)
+            spread = dist.LogNormal(math.log(REACH) * one, 0.5 * one).to_event(1)
+            sites.append(normal(f"{name}_center", 0.0 * one, (inputs,)))
+            sites.append(Site(f"{name}_half_width", spread, (inputs,)))
+        elif self.learn_locations:
+            sites.append(normal(f"{name}_locations", Z, (inducing, inputs)))
+        values = torch.zeros(self.outputs, Z.shape[-2], dtype=torch.float64)
+        sites.append(normal(f"{name}_values", values, (outputs, inducing), role="free"))
+        return tuple(sites)
+
+    def function(self, values: Values) -> StaticFunction:
+        """The function at values (*b, *shape) of the sites; batch shape *b."""
+        name, Z = self.name, self.start
+        if self._even:
+            center, half_width = values[f"{name}_center"], values[f"{name}_half_width"]
+            Z = center.unsqueeze(-2) + half_width.unsqueeze(-2) * (Z / REACH)
+        elif self.learn_locations:
+            Z = values[f"{name}_locations"]
+        return StaticFunction(
+            self.kernel_prior.sampled(values),
+            Z,
+            values[f"{name}_values"],
+            values[f"{name}_output_scale"],
+            values[f"{name}_constant"],
+            values.get(f"{name}_slope"),
+            name,
+        )
+
+
 def sample_static(
     name: str,
     *,
@@ -55,27 +173,7 @@ def sample_static(
 ) -> StaticFunction:
     """Sample a static function of inputs of unit scale.
 
-    Sites (all start with ``<name>_``), * marking what depends on the options:
-
-    - the kernel's, see `sample_kernel`; by default ``lengthscale`` (d,), LogNormal(0, 1).
-    - ``output_scale`` (e,): LogNormal(0, 1).
-    - ``constant`` (e,): normal(0, 1).
-    - ``slope`` (e, d)*: normal(identity where e = d, else zero; 1).
-    - one channel: ``center`` (1,)*, normal(0, 1), and ``half_width`` (1,)*, LogNormal(log 3, 0.5),
-      of the even grid of locations; several channels, or `locations` given: ``locations`` (M, d)*,
-      normal(starting locations, 1).
-    - ``values`` (e, M): standard normal, the whitened inducing values.
-
-    Args:
-        name: prefix of the sites.
-        channels: d, number of inputs. outputs: e.
-        inducing: M, number of inducing locations, where `locations` does not say.
-        kernel: a GPyTorch kernel (of unit variance: `output_scale` multiplies it); None for a
-            Matern-3/2 with a lengthscale for each channel.
-        mean: "constant", or "linear" for a slope as well.
-        learn_locations: whether the locations are learnt; else they stay at the start.
-        locations: starting locations (M, d), or (M,) for one channel; by default
-            `starting_locations`.
+    Args: as the attributes of `StaticPrior`, which lists the sites.
 
     Returns:
         The function with the batch shape of the sites (particles).
@@ -83,37 +181,8 @@ def sample_static(
     Raises:
         ValueError: if an option or shape is wrong.
     """
-    _check_counts(channels=channels, outputs=outputs, inducing=inducing)
-    if mean not in ("constant", "linear"):
-        raise invalid("mean", expected="'constant' or 'linear'", got=repr(mean))
-    if locations is None:
-        Z = starting_locations(inducing, channels)
-    else:
-        Z = _points("locations", locations, channels)
-
-    def normal(site: str, loc: Tensor) -> Tensor:
-        return pyro.sample(f"{name}_{site}", dist.Normal(loc, 1.0).to_event(loc.dim()))
-
-    sampled = sample_kernel(name, kernel, channels)
-    zero = torch.zeros(outputs, dtype=torch.float64)
-    scale = pyro.sample(f"{name}_output_scale", dist.LogNormal(zero, 1.0).to_event(1))
-    constant = normal("constant", zero)
-    slope = None
-    if mean == "linear":
-        start = torch.zeros(outputs, channels, dtype=torch.float64)
-        if outputs == channels:
-            start.fill_diagonal_(1.0)
-        slope = normal("slope", start)
-    if learn_locations and channels == 1 and locations is None:
-        # Two numbers move the grid: free locations of one channel only trade places.
-        one = torch.ones(1, dtype=torch.float64)
-        spread = dist.LogNormal(math.log(REACH) * one, 0.5 * one).to_event(1)
-        center, half_width = normal("center", 0.0 * one), pyro.sample(f"{name}_half_width", spread)
-        Z = center.unsqueeze(-2) + half_width.unsqueeze(-2) * (Z / REACH)
-    elif learn_locations:
-        Z = normal("locations", Z)
-    values = normal("values", torch.zeros(outputs, Z.shape[-2], dtype=torch.float64))
-    return StaticFunction(sampled, Z, values, scale, constant, slope, name)
+    prior = StaticPrior(name, channels, outputs, inducing, kernel, mean, learn_locations, locations)
+    return prior.function(sample(prior.sites()))
 
 
 def static_gp(

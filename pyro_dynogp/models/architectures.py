@@ -1,12 +1,73 @@
-"""The architectures of the paper, ready made."""
+"""The public ways to make a model: one linear layer, the paper's architectures, any cascade."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from pyro_dynogp.layers.noise import Gaussian, Likelihood
-from pyro_dynogp.models.model import Cascade
-from pyro_dynogp.models.wiring import Dynamic, Static
+from pyro_dynogp.lti.modes import NoiseStructure
+from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.wiring import Dynamic, Layer, Static
+
+
+def LinearDynamicGP(
+    inputs: int,
+    *,
+    outputs: int = 1,
+    pairs: int = 5,
+    noise: NoiseStructure = "shared",
+    brownian: int | None = None,
+    feedthrough: bool = True,
+    process_noise: bool = True,
+    likelihood: Likelihood | None = None,
+    **options: Any,
+) -> Model:
+    """Output = stochastic LTI system driven by the inputs + offset + measurement noise.
+
+    The trajectory is integrated out, under Gaussian noise exactly: the observed site ``y`` carries
+    the marginal likelihood.
+
+    Args:
+        inputs: n_u, may be 0, those that channels make included. outputs: n_y.
+        pairs: P, the number of conjugate pairs (order 2P).
+        noise: "shared" (one set of Brownian motions drives all pairs) or "independent".
+        brownian: n_l, number of Brownian motions; by default n_y.
+        feedthrough: whether the input acts on the output at once.
+        process_noise: whether there is any.
+        likelihood: Gaussian by default.
+        options: of `Model`: initial_state, priors, direct, channels, scaling.
+
+    Raises:
+        ValueError: on numbers below the least that makes sense, or unknown options.
+    """
+    layer = Dynamic(
+        outputs=outputs,
+        pairs=pairs,
+        noise=noise,
+        brownian=brownian,
+        feedthrough=feedthrough,
+        process_noise=process_noise,
+    )
+    options = {"integrate": "all", **options}
+    return Model(inputs, (layer,), likelihood or Gaussian(), **options)
+
+
+def Cascade(
+    inputs: int, layers: Sequence[Layer], likelihood: Likelihood | None = None, **options: Any
+) -> Model:
+    """Dynamic and static layers in any order, whose trajectories are sample sites.
+
+    Args:
+        inputs: n_u, may be 0; those that channels make included.
+        layers: `Dynamic` and `Static` layers, first to last.
+        likelihood: `Gaussian()` by default, `StudentT(...)` or `Heteroscedastic(...)`.
+        options: of `Model`: initial_state, integrate, priors, direct, channels, scaling.
+
+    Raises:
+        ValueError: on layers that do not fit together, or unknown options.
+    """
+    return Model(inputs, tuple(layers), likelihood or Gaussian(), **options)
 
 
 def Wiener(
@@ -19,7 +80,7 @@ def Wiener(
     process_noise: bool = True,
     likelihood: Likelihood | None = None,
     **options: Any,
-) -> Cascade:
+) -> Model:
     """Linear dynamics g, then a static nonlinearity f: a sensor that is not linear.
 
     Args:
@@ -28,13 +89,13 @@ def Wiener(
         kernel: of f, a gpytorch kernel; Matern-3/2 by default.
         process_noise: whether g has any.
         likelihood: Gaussian by default.
-        options: of `Cascade`.
+        options: of `Model`: initial_state, integrate, priors, direct, channels, scaling.
     """
     layers = (
         Dynamic(outputs=outputs, pairs=pairs, process_noise=process_noise),
         Static(outputs=outputs, inducing=inducing, kernel=kernel),
     )
-    return Cascade(inputs, layers, likelihood or Gaussian(), **options)
+    return Model(inputs, layers, likelihood or Gaussian(), **options)
 
 
 def Hammerstein(
@@ -47,7 +108,7 @@ def Hammerstein(
     process_noise: bool = True,
     likelihood: Likelihood | None = None,
     **options: Any,
-) -> Cascade:
+) -> Model:
     """A static nonlinearity f of the inputs, then linear dynamics g: a nonlinear actuator.
 
     Args: as those of `Wiener`; f has one output for each input.
@@ -56,7 +117,7 @@ def Hammerstein(
         Static(outputs=max(inputs, 1), inducing=inducing, kernel=kernel),
         Dynamic(outputs=outputs, pairs=pairs, process_noise=process_noise),
     )
-    return Cascade(inputs, layers, likelihood or Gaussian(), **options)
+    return Model(inputs, layers, likelihood or Gaussian(), **options)
 
 
 def WienerHammerstein(
@@ -70,7 +131,7 @@ def WienerHammerstein(
     process_noise: bool | tuple[bool, bool] = True,
     likelihood: Likelihood | None = None,
     **options: Any,
-) -> Cascade:
+) -> Model:
     """Linear dynamics g1, a static nonlinearity f, linear dynamics g2.
 
     Args: as those of `Wiener`; pairs and process_noise for both dynamic layers or for each; width
@@ -83,7 +144,7 @@ def WienerHammerstein(
         Static(outputs=width, inducing=inducing, kernel=kernel),
         Dynamic(outputs=outputs, pairs=second, process_noise=noise[1]),
     )
-    return Cascade(inputs, layers, likelihood or Gaussian(), **options)
+    return Model(inputs, layers, likelihood or Gaussian(), **options)
 
 
 def HammersteinWiener(
@@ -96,7 +157,7 @@ def HammersteinWiener(
     process_noise: bool = True,
     likelihood: Likelihood | None = None,
     **options: Any,
-) -> Cascade:
+) -> Model:
     """A static nonlinearity f1 of the inputs, linear dynamics g, a static nonlinearity f2.
 
     Args: as those of `Wiener`; inducing for both static layers or for each.
@@ -107,4 +168,4 @@ def HammersteinWiener(
         Dynamic(outputs=outputs, pairs=pairs, process_noise=process_noise),
         Static(outputs=outputs, inducing=second, kernel=kernel),
     )
-    return Cascade(inputs, layers, likelihood or Gaussian(), **options)
+    return Model(inputs, layers, likelihood or Gaussian(), **options)

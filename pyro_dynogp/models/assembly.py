@@ -22,7 +22,7 @@ from pyro_dynogp.lti.grid import TimeGrid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import mean_response
 from pyro_dynogp.models.filter_functions import Block, functions_of
-from pyro_dynogp.models.system import CascadeSystem, DynamicSystem, StaticSystem
+from pyro_dynogp.models.system import DynamicSystem, StaticSystem, System
 from pyro_dynogp.models.wiring import INPUTS, Dynamic, Wire
 from pyro_dynogp.moments.problem import FilterProblem, make_layout
 
@@ -65,7 +65,7 @@ class Assembly:
         return replace(self.problem, y=y)
 
 
-def count_states(system: CascadeSystem) -> int:
+def count_states(system: System) -> int:
     """N, the real states of all dynamic layers."""
     layers = system.layers
     return sum(2 * one.modes.pairs for one in layers if isinstance(one, DynamicSystem))
@@ -91,10 +91,8 @@ def count_outputs(wires: Sequence[Wire]) -> int:
 class _Assembler:
     """Walks through the layers once; holds what has been found so far."""
 
-    def __init__(
-        self, system: CascadeSystem, grid: TimeGrid, inputs: Tensor, process_noise: bool
-    ) -> None:
-        self.system, self.grid, self.process_noise = system, grid, process_noise
+    def __init__(self, system: System, grid: TimeGrid, inputs: Tensor) -> None:
+        self.system, self.grid = system, grid
         self.batch = system.batch_shape
         self.states = count_states(system)
         self.total = self.states + count_outputs(system.wires)
@@ -159,7 +157,7 @@ class _Assembler:
             held = self.add_block(seen, None, False)
             seen = Signal(held.known, held.rows, held.outputs)
             known = held.known
-        modes = layer.modes if self.process_noise else layer.modes.without_process_noise()
+        modes = layer.modes
         responded = mean_response(
             modes, self.grid, known if modes.inputs else None, layer.first_state
         )
@@ -174,7 +172,7 @@ class _Assembler:
                 select[i, o] = 1.0
         self.gains.append(self.expand(gain @ select, 3))
         self.modes.append(modes)
-        covariance = layer.prior_state(self.process_noise).covariance
+        covariance = layer.prior_state().covariance
         assert covariance is not None  # a prior always has one
         self.covariances.append(covariance)
         rows = self.state_rows(modes)
@@ -268,25 +266,25 @@ class _Assembler:
 
 
 def assemble(
-    system: CascadeSystem, grid: TimeGrid, inputs: Tensor, *, process_noise: bool = True
+    system: System, grid: TimeGrid, inputs: Tensor, noise_sd: Tensor | None = None
 ) -> Assembly:
     """Write a cascade as a problem for the filter.
 
     Args:
         system: the layers given their parameters, batch shape *b.
         grid: time axis. inputs: (n, n_u) scaled.
-        process_noise: False for the deterministic system from an unknown first state.
+        noise_sd: (*b, n, n_y) of scaled outputs; by default what the system has along the inputs.
 
     Raises:
         ValueError: where a static layer of several channels has a kernel that is not radial.
     """
-    walk = _Assembler(system, grid, inputs, process_noise)
+    walk = _Assembler(system, grid, inputs)
     for one, layer in zip(system.wires, system.layers, strict=True):
         if isinstance(layer, DynamicSystem):
             walk.signals[one.name] = walk.dynamic(one, layer)
         else:
             walk.signals[one.name] = walk.static(one, layer)
-    return walk.finish(system.noise_sd(inputs, grid))
+    return walk.finish(system.noise_sd(inputs, grid) if noise_sd is None else noise_sd)
 
 
 def step_noises(modes: Modes, steps: Tensor) -> Tensor:

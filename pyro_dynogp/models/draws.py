@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from pyro_dynogp.distributions.process import LTIProcess
-from pyro_dynogp.lti.grid import TimeGrid, time_grid
+from pyro_dynogp.layers.functions import support_points
+from pyro_dynogp.layers.noise import Likelihood
+from pyro_dynogp.lti.grid import TimeGrid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import mean_response
 from pyro_dynogp.lti.state import ModalState
-from pyro_dynogp.models.model import support_points
-from pyro_dynogp.models.system import CascadeSystem, DynamicSystem, StaticSystem, see
+from pyro_dynogp.models.system import DynamicSystem, StaticSystem, System, see
 from pyro_dynogp.models.wiring import INPUTS, Static
+from pyro_dynogp.support.tensors import broadcast
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +32,41 @@ class JointState:
 
     mean: Tensor
     covariance: Tensor
+
+    @classmethod
+    def of_layers(cls, means: Sequence[Tensor], covariances: Sequence[Tensor]) -> JointState:
+        """From complex means (*b, P) and real covariances (*b, 2P, 2P) of the layers' states."""
+        half = sum(mean.shape[-1] for mean in means)
+        batch = broadcast(*(mean.shape[:-1] for mean in means))
+        mean = torch.zeros((*batch, 2 * half), dtype=torch.float64)
+        covariance = torch.zeros((*batch, 2 * half, 2 * half), dtype=torch.float64)
+        before = 0
+        for part, own in zip(means, covariances, strict=True):
+            P = part.shape[-1]
+            index = torch.cat([torch.arange(P), torch.arange(P) + half]) + before
+            real = torch.cat([part.real, part.imag], -1)
+            mean[..., index] = real.expand((*batch, 2 * P))
+            covariance[..., index[:, None], index] = own.expand((*batch, 2 * P, 2 * P))
+            before += P
+        return cls(mean, covariance)
+
+    def modal(self) -> ModalState:
+        """The state of a single layer."""
+        half = self.mean.shape[-1] // 2
+        return ModalState(
+            torch.complex(self.mean[..., :half], self.mean[..., half:]), self.covariance
+        )
+
+    def first_of(self, system: System) -> System:
+        """A system whose first states are the means."""
+        half, before = self.mean.shape[-1] // 2, 0
+        first = {}
+        for wire, layer in system.dynamic:
+            own = slice(before, before + layer.modes.pairs)
+            real, imag = self.mean[..., :half], self.mean[..., half:]
+            first[wire.name] = torch.complex(real[..., own], imag[..., own])
+            before += layer.modes.pairs
+        return system.with_layers(lambda wire, layer: replace(layer, first_state=first[wire.name]))
 
     def root(self) -> Tensor:
         """Square root (*b, N, N) of the covariance, singular or not."""
@@ -50,7 +88,7 @@ class Randomness:
     residual: Mapping[str, Tensor]
 
     @classmethod
-    def draw(cls, system: CascadeSystem, n: int, shape: torch.Size) -> Randomness:
+    def draw(cls, system: System, n: int, shape: torch.Size) -> Randomness:
         """From torch's generator."""
         states = 0
         innovations, residual = {}, {}
@@ -99,16 +137,10 @@ class Switches:
         return self.initial_state or bool(self.process_noise) or self.functions
 
     @classmethod
-    def all_on(
-        cls, system: CascadeSystem, process_noise: bool = True, several_channels: bool = False
-    ) -> Switches:
-        """Everything acts; process noise and functions of several channels only if asked for."""
-        names = {
-            one.name
-            for one, layer in zip(system.wires, system.layers, strict=True)
-            if isinstance(layer, DynamicSystem) and layer.modes.has_process_noise
-        }
-        return cls(True, frozenset(names if process_noise else ()), True, several_channels)
+    def all_on(cls, system: System, several_channels: bool = False) -> Switches:
+        """Everything acts; functions of several channels only if asked for."""
+        names = {wire.name for wire, layer in system.dynamic if layer.modes.has_process_noise}
+        return cls(True, frozenset(names), True, several_channels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +159,7 @@ class Drawn:
 
 
 def draw_layers(
-    system: CascadeSystem,
+    system: System,
     grid: TimeGrid,
     inputs: Tensor,
     start: JointState,
@@ -253,35 +285,31 @@ def fresh_noise(modes: Modes, grid: TimeGrid) -> LTIProcess:
     return LTIProcess(alone, grid, None, known)
 
 
-def known_start(system: CascadeSystem) -> Tensor:
-    """State (*b, N) that past inputs are known to have left at the first sample, else zero."""
-    parts = []
-    for layer in system.layers:
-        if isinstance(layer, DynamicSystem):
-            x = layer.first_state
-            x = torch.zeros_like(layer.modes.poles) if x is None else x
-            parts.append(x.expand((*system.batch_shape, layer.modes.pairs)))
-    if not parts:
-        return torch.zeros(0, dtype=torch.float64)
-    joined = torch.cat(parts, -1)
-    return torch.cat([joined.real, joined.imag], -1)
+def first_state(system: System) -> JointState:
+    """State of all dynamic layers at the first sample: what past inputs and process noise left."""
+    priors = [layer.prior_state() for _, layer in system.dynamic]
+    if not priors:
+        return JointState(torch.zeros(0).double(), torch.zeros(0, 0).double())
+    covariances = [prior.covariance for prior in priors if prior.covariance is not None]
+    return JointState.of_layers([prior.mean for prior in priors], covariances)
 
 
-def draw_outputs(system: CascadeSystem, time: Any, inputs: Tensor, shape: torch.Size) -> Tensor:
-    """Noisy scaled outputs (*shape, n, n_y) from inputs alone; shape ends in the batch shape."""
-    from pyro_dynogp.models.assembly import assemble
+def noise_variance(
+    likelihood: Likelihood, sd: Tensor, count: int, generator: np.random.Generator
+) -> np.ndarray:
+    """Variance (count, n, n_y) of noise of scale sd (*b, n, n_y) for each of many components.
 
-    grid = time_grid(time)
-    problem = assemble(system, grid, inputs).problem
-    start = JointState(known_start(system), problem.P0)
-    random = Randomness.draw(system, len(grid), shape)
-    on = Switches.all_on(system, several_channels=True)  # the model as it is stated
-    drawn = draw_layers(system, grid, inputs, start, random, on)
-    signal = drawn.signals[system.wires[-1].name]
-    if isinstance(system.layers[-1], DynamicSystem):
-        level = system.level(inputs)
-        signal = signal if level is None else signal + level
-    else:
-        signal = drawn.mean + drawn.variance.sqrt() * torch.randn_like(drawn.mean)
-    noise = system.noise.distribution(signal, system.noise_sd(inputs, grid), None)
-    return noise.sample()
+    A Student-t's is drawn.
+    """
+    flat = sd.reshape(-1, *sd.shape[-2:]).numpy()
+    variance = np.broadcast_to(flat, (len(flat), *flat.shape[1:])) ** 2
+    variance = np.tile(variance, (-(-count // len(variance)), 1, 1))[:count]
+    return variance * variance_multiples(likelihood, variance.shape, generator)
+
+
+def variance_multiples(
+    likelihood: Likelihood, shape: tuple[int, ...], generator: np.random.Generator
+) -> np.ndarray | float:
+    """Draws of what multiplies the variance of Gaussian noise: inverse gammas for a Student-t."""
+    nu = likelihood.degrees_of_freedom
+    return 1.0 if nu is None else 0.5 * nu / generator.standard_gamma(0.5 * nu, shape)

@@ -8,11 +8,10 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.distributions.process import LTIProcess
-from pyro_dynogp.models.system import CascadeSystem, DynamicSystem, StaticSystem, see
+from pyro_dynogp.models.output_process import OutputProcess
+from pyro_dynogp.models.system import DynamicSystem, StaticSystem, see
 from pyro_dynogp.models.wiring import INPUTS, Wire
-from pyro_dynogp.support.tensors import as_tensor
 
 # Least variance of the conditional of a static layer's value (scaled units): its density is finite
 # where a sample lies on an inducing location.
@@ -20,58 +19,50 @@ TINY = 1e-10
 
 
 def observe_explicit(
-    system: CascadeSystem,
-    scaling: Scaling,
-    record: Record,
-    suffix: str,
-    inputs: Tensor,
-    *,
-    last_integrated: bool,
+    outputs: OutputProcess, record: Record, suffix: str, *, last_integrated: bool
 ) -> None:
-    """Sample every trajectory, then the outputs, of scaled inputs (*b, n, n_u).
+    """Sample every trajectory, then the outputs.
 
     With `last_integrated` the trajectory of a dynamic last layer is integrated out.
     """
+    system, inputs = outputs.system, outputs.scaled_inputs
     y, missing = outputs_of(record)
-    several = len(scaling.output_scale) > 1
-    scale, shift = as_tensor(scaling.output_scale), as_tensor(scaling.output_offset)
     signals = {INPUTS: system.driving(inputs)}
-    for one, layer in zip(system.wires, system.layers, strict=True):
-        x = see(signals, one)
+    for wire, layer in zip(system.wires, system.layers, strict=True):
+        x = see(signals, wire)
         if isinstance(layer, DynamicSystem):
             driven = x if layer.modes.inputs else None
             process = LTIProcess(layer.modes, record.time, driven, layer.prior_state())
-            if one.last and last_integrated:
-                observe_linear(process, system, scaling, record, suffix)
+            if wire.last and last_integrated:
+                observe_linear(process, outputs, record, suffix)
                 return
-            value = pyro.sample(one.name + suffix, process)
-            signals[one.name] = value if layer.modes.several_outputs else value.unsqueeze(-1)
+            value = pyro.sample(wire.name + suffix, process)
+            signals[wire.name] = value if layer.modes.several_outputs else value.unsqueeze(-1)
         else:
-            signals[one.name] = _sample_function(one, layer, x, suffix)
+            signals[wire.name] = _sample_function(wire, layer, x, suffix)
     mean = signals[system.wires[-1].name]
     level = system.level(inputs)
     if level is not None:
         mean = mean + level
-    mean = shift + scale * mean
-    sd = scale * system.noise_sd(inputs, record.time)
-    if not several:
+    mean, sd = outputs.shift + outputs.scale * mean, outputs.scale * outputs.noise_sd
+    if not outputs.several:
         mean, sd = mean.squeeze(-1), sd.squeeze(-1)
     noise = system.noise.distribution(mean, sd, missing)
-    pyro.sample(f"y{suffix}", noise.to_event(1 + several), obs=y)
+    pyro.sample(f"y{suffix}", noise.to_event(1 + outputs.several), obs=y)
 
 
-def _sample_function(one: Wire, layer: StaticSystem, x: Tensor, suffix: str) -> Tensor:
-    several = one.layer.outputs > 1
-    if one.pathwise:
+def _sample_function(wire: Wire, layer: StaticSystem, x: Tensor, suffix: str) -> Tensor:
+    several = wire.layer.outputs > 1
+    if wire.pathwise:
         value = layer(x)
         value = value if several else value.squeeze(-1)
-        value = pyro.deterministic(one.name + suffix, value, event_dim=1 + several)
+        value = pyro.deterministic(wire.name + suffix, value, event_dim=1 + several)
     else:
         mean, variance = layer.function.mean(x), layer.function.variance(x)
         if not several:
             mean, variance = mean.squeeze(-1), variance.squeeze(-1)
         sd = (variance + TINY).sqrt()
-        value = pyro.sample(one.name + suffix, dist.Normal(mean, sd).to_event(1 + several))
+        value = pyro.sample(wire.name + suffix, dist.Normal(mean, sd).to_event(1 + several))
     return value if several else value.unsqueeze(-1)
 
 
@@ -85,16 +76,15 @@ def outputs_of(record: Record) -> tuple[Tensor | None, Tensor | None]:
 
 
 def observe_linear(
-    process: LTIProcess, system: CascadeSystem, scaling: Scaling, record: Record, suffix: str
+    process: LTIProcess, outputs: OutputProcess, record: Record, suffix: str
 ) -> None:
     """Observe a dynamic last layer, its trajectory integrated out."""
-    several = process.modes.several_outputs
-    scale, shift = as_tensor(scaling.output_scale), as_tensor(scaling.output_offset)
+    system, scale, shift = outputs.system, outputs.scale, outputs.shift
     assert system.offset is not None
     assert system.noise.constant_sd is not None
     level, sd = shift + scale * system.offset, scale * system.noise.constant_sd
-    modes = process.modes.rescale(outputs=scale if several else scale[0])
-    if not several:
+    modes = process.modes.rescale(outputs=scale if outputs.several else scale[0])
+    if not outputs.several:
         level, sd = level.squeeze(-1), sd.squeeze(-1)
     driven = process.inputs if modes.inputs else None
     physical = LTIProcess(modes, process.grid, driven, process.initial_state, offset=level)

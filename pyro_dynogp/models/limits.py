@@ -8,11 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 import pyro
 import torch
-from torch import Tensor
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.scaling import Scaling
-from pyro_dynogp.models.system import CascadeSystem
+from pyro_dynogp.models.output_process import OutputProcess
 from pyro_dynogp.models.wiring import Layer, Limits, Static
 from pyro_dynogp.support.errors import invalid
 
@@ -46,19 +45,16 @@ def at_limits(layers: Sequence[Layer], record: Record) -> np.ndarray:
     return there
 
 
-def count_as_probabilities(
-    at: np.ndarray, system: CascadeSystem, record: Record, suffix: str, inputs: Tensor
-) -> None:
+def count_as_probabilities(at: np.ndarray, outputs: OutputProcess, suffix: str) -> None:
     """Take outputs that are exactly at a limit for what they are: probabilities.
 
     Their density, which has no upper bound where the noise vanishes, times sqrt(2 pi) times the
     noise's scale is at most one, as the probability of being beyond the limit is.
 
     Args:
-        at: (n,) where they are. system: of the record. suffix: of the record's sites.
-        inputs: (*b, n, n_u) scaled.
+        at: (n,) where they are. outputs: of the record. suffix: of the record's sites.
     """
     if at.any():
-        sd = system.noise_sd(inputs, record.time)[..., 0]
+        sd = outputs.noise_sd[..., 0]
         sd = sd.expand((*sd.shape[:-1], len(at)))[..., torch.as_tensor(at)]
         pyro.factor(f"at_limits{suffix}", (sd.log() + 0.5 * math.log(2.0 * math.pi)).sum(-1))

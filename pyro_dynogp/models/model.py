@@ -1,10 +1,10 @@
-"""Cascades of dynamic and static Gaussian-process layers as Pyro models."""
+"""The model: dynamic and static Gaussian-process layers, then measurement noise, in Pyro."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, get_args
 
 import pyro
 import pyro.distributions as dist
@@ -14,55 +14,67 @@ from torch import Tensor
 from pyro_dynogp.data.channels import Channel
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.scaling import Scaling
-from pyro_dynogp.layers.functions import StaticFunction
+from pyro_dynogp.layers.functions import StaticFunction, support_points
 from pyro_dynogp.layers.noise import Gaussian, Likelihood
-from pyro_dynogp.layers.static import sample_static
+from pyro_dynogp.layers.sites import Site, Values, sample
+from pyro_dynogp.layers.static import StaticPrior
+from pyro_dynogp.models.checks import check_direct, check_records, prepare
 from pyro_dynogp.models.explicit import observe_explicit
 from pyro_dynogp.models.limits import at_limits, count_as_probabilities, scaled_limits
-from pyro_dynogp.models.linear import (
-    check_direct,
-    check_records,
-    past_input_covariance,
-    prepare,
+from pyro_dynogp.models.outputs import output_process
+from pyro_dynogp.models.priors import (
+    FLAT,
+    ModesPrior,
+    PriorName,
+    TimeScale,
+    direct_site,
 )
-from pyro_dynogp.models.outputs import observe_collapsed
-from pyro_dynogp.models.priors import FLAT, PriorName, TimeScale, sample_direct, sample_modes
-from pyro_dynogp.models.system import CascadeSystem, DynamicSystem, StaticSystem, scaled_inputs
+from pyro_dynogp.models.system import DynamicSystem, StaticSystem, System
 from pyro_dynogp.models.wiring import Dynamic, Layer, Static, Wire, wire
 from pyro_dynogp.support.errors import invalid
 
 Integrate = Literal["none", "last", "all"]
+InitialState = Literal["auto", "site", "integrated", "zero"]
 
 
 @dataclass(frozen=True)
-class Cascade:
+class Model:
     """Dynamic and static layers in any order, then measurement noise: a Pyro model.
 
-    Calling the model with a record (or several, which share all parameters) runs it. Signals are
-    scaled inside: layers see inputs of unit standard deviation, and priors are stated so.
+    `LinearDynamicGP`, `Wiener`, `Hammerstein`, `WienerHammerstein`, `HammersteinWiener` and
+    `Cascade` make one. Calling the model with a record (or several, which share all parameters)
+    runs it; a record without outputs leaves ``y`` unobserved, to be sampled. Signals are scaled
+    inside: layers see inputs of unit standard deviation, and priors are stated so.
 
-    Sites, for a layer g: those of `sample_modes` (``g_log_decay``, ...) and the trajectory ``g``
-    (n,) or (n, width). For a static layer f: those of `sample_static` (``f_values``, the whitened
-    inducing values, ...), and ``f`` (n,) or (n, width): in a last layer a site of its own, the
-    conditional given the inducing values; below a dynamic layer one function along the path, which
-    ``f_residual`` completes (`pyro.deterministic`). ``offset`` (n_y,) where a dynamic layer comes
-    last; the likelihood's sites; ``y``. With several records trajectories and outputs are numbered
-    (``g_0``, ``y_0``, ...). ``direct`` (n_y, K) for inputs that act at once. Where the last layer
-    has limits, a factor ``at_limits`` makes probabilities of outputs that are exactly there.
+    Sites, for a dynamic layer g those of `ModesPrior` (``g_log_decay``, ...), for a static layer f
+    those of `StaticPrior` (``f_values``, the whitened inducing values, ...); ``direct`` (n_y, K)
+    for inputs that act at once; ``offset`` (n_y,) where a dynamic layer comes last; the
+    likelihood's sites (``noise_sd`` (n_y,), log-normal around 0.1); ``y``. Where trajectories are
+    not integrated out: the trajectory ``g`` (n,) or (n, width), and ``f``, in a last layer a site
+    of its own, the conditional given the inducing values; below a dynamic layer one function along
+    the path, which ``f_residual`` completes (`pyro.deterministic`). With several records first
+    states, trajectories and outputs are numbered (``g_0``, ``y_0``, ...). Where the last layer has
+    limits, a factor ``at_limits`` makes probabilities of outputs that are exactly there.
 
     Args:
-        inputs: n_u, those that channels make included.
+        inputs: n_u, may be 0; those that channels make included.
         layers: `Dynamic` and `Static` layers, first to last.
         likelihood: `Gaussian()`, `StudentT(...)` or `Heteroscedastic(...)`.
-        initial_state: "site": what past inputs left in a layer that a static layer sees is a site,
-            ``g_initial_state`` (2P,), standard normal; in layers from which on all is linear it is
-            integrated out. "integrated": everywhere (moment matching is then poor at the beginning
-            of a record: the state is too uncertain for it). "zero": nothing is left. Past process
-            noise is always there.
+        initial_state: what past inputs left in a dynamic layer at the first sample. "auto": in a
+            layer that a static layer sees it is a site, ``g_initial_state`` (2P,), standard
+            normal; in other layers it is integrated out. "site": a site in every layer.
+            "integrated": everywhere (below a static layer moment matching is then poor at the
+            beginning of a record: the state is too uncertain for it). "zero": nothing is left. Past
+            process noise is always there.
         integrate: "none" keeps every trajectory as a site; "last" integrates a dynamic last layer
-            under Gaussian noise, exactly; "all" integrates all trajectories by the moment-matching
-            filter, exactly where the layers are linear.
-        direct, channels: as of `LinearDynamicGP`; the layers do not see direct inputs.
+            under Gaussian noise, exactly; "all" integrates all trajectories, exactly where they are
+            linear, else by the moment-matching filter.
+        priors: "default", or "paper" for flat ones but for the horseshoe on the noise gains: fit
+            with them, but do not sample from them, their draws exceed floating-point range.
+        direct: the last K inputs act on the output at once and without dynamics (trends, steps,
+            calendars), and the layers do not see them: their weights are the site ``direct``,
+            normal(0, 1) in standard deviations.
+        channels: made from each record before the model sees it, see `pyro_dynogp.data.channels`.
         scaling: learnt by `fit` from the training record; else from the record at hand.
 
     Raises:
@@ -75,7 +87,7 @@ class Cascade:
     inputs: int
     layers: tuple[Layer, ...]
     likelihood: Likelihood = field(default_factory=Gaussian)
-    initial_state: Literal["site", "integrated", "zero"] = "site"
+    initial_state: InitialState = "auto"
     integrate: Integrate = "none"
     priors: PriorName = "default"
     direct: int = 0
@@ -86,22 +98,21 @@ class Cascade:
         if not isinstance(self.inputs, int) or self.inputs < 0:
             raise invalid("inputs", expected="a whole number >= 0", got=repr(self.inputs))
         object.__setattr__(self, "layers", tuple(self.layers))
+        object.__setattr__(self, "channels", tuple(self.channels))
         if not isinstance(self.likelihood, Likelihood):
             raise invalid(
                 "likelihood",
                 expected="Gaussian(), StudentT(...) or Heteroscedastic(...)",
                 got=repr(self.likelihood),
             )
-        if self.priors not in ("default", "paper"):
-            raise invalid("priors", expected="'default' or 'paper'", got=repr(self.priors))
-        if self.integrate not in ("none", "last", "all"):
-            raise invalid("integrate", expected="'none', 'last' or 'all'", got=repr(self.integrate))
-        if self.initial_state not in ("site", "integrated", "zero"):
-            raise invalid(
-                "initial_state",
-                expected="'site', 'integrated' or 'zero'",
-                got=repr(self.initial_state),
-            )
+        for name, choices in (
+            ("priors", get_args(PriorName)),
+            ("integrate", get_args(Integrate)),
+            ("initial_state", get_args(InitialState)),
+        ):
+            if getattr(self, name) not in choices:
+                expected = f"one of {list(choices)}"
+                raise invalid(name, expected=expected, got=repr(getattr(self, name)))
         check_direct(self.inputs, self.direct, self.channels)
         object.__setattr__(self, "_wires", wire(self.inputs - self.direct, self.layers))
         last = self.layers[-1]
@@ -122,23 +133,6 @@ class Cascade:
         return wires
 
     @property
-    def state_sites(self) -> tuple[Wire, ...]:
-        """Dynamic layers whose first state is a site: those that a static layer sees."""
-        if self.initial_state != "site":
-            return ()
-        seen = {
-            name
-            for place, one in enumerate(self.wires)
-            if any(isinstance(w.layer, Static) for w in self.wires[place:])
-            for name in one.sources
-        }
-        return tuple(
-            one
-            for one in self.wires
-            if isinstance(one.layer, Dynamic) and one.name in seen and one.channels
-        )
-
-    @property
     def outputs(self) -> int:
         """n_y, the width of the last layer."""
         return self.layers[-1].outputs
@@ -149,48 +143,151 @@ class Cascade:
         return self.outputs > 1
 
     @property
-    def collapsed(self) -> Cascade:
+    def is_linear(self) -> bool:
+        """Whether it is one layer of linear dynamics, whatever the noise."""
+        return len(self.layers) == 1 and isinstance(self.layers[0], Dynamic)
+
+    @property
+    def has_function(self) -> bool:
+        """Whether there is a static layer."""
+        return any(isinstance(layer, Static) for layer in self.layers)
+
+    @property
+    def dynamic(self) -> tuple[tuple[Wire, Dynamic], ...]:
+        """The dynamic layers in their places, first to last."""
+        return tuple((w, w.layer) for w in self.wires if isinstance(w.layer, Dynamic))
+
+    @property
+    def seen_by_functions(self) -> tuple[Wire, ...]:
+        """Dynamic layers with inputs whose trajectory a static layer sees, also through others."""
+        names = {
+            name
+            for place, reader in enumerate(self.wires)
+            if any(isinstance(w.layer, Static) for w in self.wires[place:])
+            for name in reader.sources
+        }
+        return tuple(w for w, _ in self.dynamic if w.channels and w.name in names)
+
+    @property
+    def state_sites(self) -> tuple[Wire, ...]:
+        """Dynamic layers whose first state is a site."""
+        if self.initial_state == "site":
+            return tuple(w for w, _ in self.dynamic if w.channels)
+        return self.seen_by_functions if self.initial_state == "auto" else ()
+
+    @property
+    def collapsed(self) -> Model:
         """The same model with all trajectories integrated out."""
         return replace(self, integrate="all")
 
-    def scaled_to(self, records: Record | Sequence[Record]) -> Cascade:
+    def scaled_to(self, records: Record | Sequence[Record]) -> Model:
         """The same model with the scaling of the given training record(s)."""
         return replace(self, scaling=Scaling.from_records(prepare(self, records)))
 
     def check(self, records: Record | Sequence[Record]) -> tuple[Record, ...]:
-        """Records whose channels and units fit the model.
+        """Records prepared with the model's channels, whose channels and units fit the model.
 
         Raises:
             ValueError: where the number of channels or a unit differs.
         """
         return check_records(self, records)
 
-    def sample_system(self, scaling: Scaling) -> CascadeSystem:
-        """Sample the parameters of all layers."""
-        time_scale = TimeScale.of(scaling)
-        systems: list[DynamicSystem | StaticSystem] = []
-        for one in self.wires:
-            if isinstance(one.layer, Dynamic):
-                systems.append(self.sample_dynamic_layer(one, one.layer, time_scale))
+    def sites(self, scaling: Scaling) -> tuple[Site, ...]:
+        """Sites of the parameters, in the order in which they are sampled.
+
+        Args:
+            scaling: of the training record.
+        """
+        return tuple(self._sites(scaling))
+
+    def _sites(self, scaling: Scaling) -> Iterator[Site]:
+        time_scale, flat = TimeScale.of(scaling), self.priors == "paper"
+        for w in self.wires:
+            if isinstance(w.layer, Dynamic):
+                yield from self._modes_prior(w, w.layer, time_scale).sites(w.dims)
             else:
-                systems.append(self._sample_static(one, one.layer, scaling))
-        flat = self.priors == "paper"
-        offset = None
+                yield from self._static_prior(w, w.layer).sites(w.dims)
+                if self._has_residual(w):
+                    zero = torch.zeros(w.layer.outputs, w.layer.support, dtype=torch.float64)
+                    prior = dist.Normal(zero, zero + 1.0).to_event(2)
+                    dims = (w.dims["output"], w.dims["support"])
+                    yield Site(f"{w.name}_residual", prior, dims, role="free")
+        if self.direct:
+            yield direct_site(self.direct, self.outputs, flat=flat)
         if isinstance(self.layers[-1], Dynamic):
             zero = torch.zeros(self.outputs, dtype=torch.float64)
-            spread = FLAT if flat else 1.0
-            offset = pyro.sample("offset", dist.Normal(zero, zero + spread).to_event(1))
-        noise = self.likelihood.sample(self.outputs, self.inputs - self.direct, flat=flat)
-        direct = sample_direct(self.direct, self.outputs, flat=flat) if self.direct else None
-        return CascadeSystem(self.wires, tuple(systems), noise, offset, direct)
+            prior = dist.Normal(zero, zero + (FLAT if flat else 1.0)).to_event(1)
+            yield Site("offset", prior, ("output",))
+        yield from self.likelihood.sites(self.outputs, self.inputs - self.direct, flat=flat)
 
-    def sample_dynamic_layer(
-        self, one: Wire, layer: Dynamic, time_scale: TimeScale
+    def state_sites_of(self, suffix: str) -> tuple[Site, ...]:
+        """Sites of what past inputs left at the first sample of a record.
+
+        Args:
+            suffix: of the record's sites: empty, or its number where there are several.
+        """
+        sites = []
+        for w, layer in self.dynamic:
+            if w in self.state_sites:
+                zero = torch.zeros(2 * layer.pairs, dtype=torch.float64)
+                prior = dist.Normal(zero, zero + 1.0).to_event(1)
+                name, dims = f"{w.name}_initial_state{suffix}", (w.dims["state"],)
+                sites.append(Site(name, prior, dims, role="free", growth=0.0))
+        return tuple(sites)
+
+    def all_sites(self, scaling: Scaling, records: int) -> tuple[Site, ...]:
+        """Sites of parameters and first states for so many training records."""
+        suffixes = [""] if records == 1 else [f"_{index}" for index in range(records)]
+        states = [site for suffix in suffixes for site in self.state_sites_of(suffix)]
+        return (*self.sites(scaling), *states)
+
+    def system(self, values: Values, scaling: Scaling) -> System:
+        """All layers at values (*b, *shape) of the parameters' sites: no sampling, no Pyro.
+
+        Args:
+            values: of the sites of `sites`. scaling: of the training record.
+        """
+        time_scale = TimeScale.of(scaling)
+        layers: list[DynamicSystem | StaticSystem] = []
+        for w in self.wires:
+            if isinstance(w.layer, Dynamic):
+                layers.append(self.dynamic_system(w, w.layer, values, time_scale))
+            else:
+                layers.append(self._static_system(w, w.layer, values, scaling))
+        noise = self.likelihood.noise(values, self.outputs, self.inputs - self.direct)
+        direct = values["direct"] if self.direct else None
+        return System(self.wires, tuple(layers), noise, values.get("offset"), direct)
+
+    def sample_system(self, scaling: Scaling) -> System:
+        """Sample the parameters of all layers."""
+        return self.system(sample(self.sites(scaling)), scaling)
+
+    def dynamic_system(
+        self, place: Wire, layer: Dynamic, values: Values, time_scale: TimeScale
     ) -> DynamicSystem:
-        """Sample the parameters of one dynamic layer."""
-        modes = sample_modes(
-            one.name,
-            inputs=one.channels,
+        """One dynamic layer at values of its sites."""
+        modes = self._modes_prior(place, layer, time_scale).modes(values)
+        return DynamicSystem(modes, 1.0 / time_scale.typical_rate)
+
+    def static_function(self, place: Wire, layer: Static, values: Values) -> StaticFunction:
+        """The function of a static layer at values of its sites."""
+        return self._static_system(place, layer, values, self.scaling).function
+
+    def _static_system(
+        self, place: Wire, layer: Static, values: Values, scaling: Scaling | None
+    ) -> StaticSystem:
+        function = self._static_prior(place, layer).function(values)
+        if layer.limits is not None:
+            function = replace(function, limits=scaled_limits(layer.limits, scaling))
+        if not self._has_residual(place):
+            return StaticSystem(function)
+        support = support_points(function.locations, layer.support)
+        return StaticSystem(function, support, values[f"{place.name}_residual"])
+
+    def _modes_prior(self, place: Wire, layer: Dynamic, time_scale: TimeScale) -> ModesPrior:
+        return ModesPrior(
+            place.name,
+            inputs=place.channels,
             pairs=layer.pairs,
             outputs=layer.outputs if layer.outputs > 1 else None,
             brownian=layer.brownian or layer.outputs,
@@ -200,86 +297,64 @@ class Cascade:
             time_scale=time_scale,
             priors=self.priors,
         )
-        return DynamicSystem(modes, past_input_covariance(modes, 1.0 / time_scale.typical_rate))
 
-    def static_given(
-        self, one: Wire, layer: Static, values: Mapping[str, Tensor]
-    ) -> StaticFunction:
-        """The function of a static layer given values of its sites; no trace sees it."""
-        with pyro.poutine.block(), pyro.poutine.condition(data=dict(values)):
-            return self._sample_static(one, layer, self.scaling).function
-
-    def _sample_static(self, one: Wire, layer: Static, scaling: Scaling | None) -> StaticSystem:
-        function = sample_static(
-            one.name,
-            channels=one.channels,
+    @staticmethod
+    def _static_prior(place: Wire, layer: Static) -> StaticPrior:
+        return StaticPrior(
+            place.name,
+            channels=place.channels,
             outputs=layer.outputs,
             inducing=layer.inducing,
             kernel=layer.kernel,
             mean=layer.mean or "constant",
             learn_locations=layer.learn_locations,
         )
-        if layer.limits is not None:
-            function = replace(function, limits=scaled_limits(layer.limits, scaling))
-        if not one.pathwise or self.integrate == "all":
-            return StaticSystem(function)
-        one_ = torch.ones(layer.outputs, layer.support, dtype=torch.float64)
-        residual = pyro.sample(f"{one.name}_residual", dist.Normal(0.0 * one_, one_).to_event(2))
-        return StaticSystem(function, support_points(function.locations, layer.support), residual)
+
+    def _has_residual(self, place: Wire) -> bool:
+        """Whether what the inducing values leave open of a static layer is drawn, too."""
+        return place.pathwise and self.integrate != "all"
 
     def __call__(
         self, records: Record | Sequence[Record], inputs: Sequence[Tensor] | None = None
     ) -> None:
-        """Run the Pyro model on one record or on several; `inputs` as of `LinearDynamicGP`."""
+        """Run the Pyro model on one record or on several.
+
+        Args:
+            records: with inputs and outputs.
+            inputs: for each record u (k, n, n_u) [input] in place of its own, where every site has
+                k values: each of them with inputs of its own.
+        """
         checked = self.check(records)
         scaling = self.scaling or Scaling.from_records(checked)
         system = self.sample_system(scaling)
         for index, record in enumerate(checked):
             suffix = "" if len(checked) == 1 else f"_{index}"
-            states = self.sample_states(suffix)
-            here = self.begin(system, states)
-            u = scaled_inputs(scaling, record, None if inputs is None else inputs[index])
+            here = self.begin(system, self.sample_states(suffix))
+            u = None if inputs is None else inputs[index]
+            outputs = output_process(here, scaling, record, u)
             if self.integrate == "all":
-                observe_collapsed(here, scaling, record, suffix, u)
+                y = record.tensors().observations if record.n_outputs else None
+                pyro.sample(f"y{suffix}", outputs, obs=y)
             else:
                 last = self.integrate == "last"
-                observe_explicit(here, scaling, record, suffix, u, last_integrated=last)
-            count_as_probabilities(at_limits(self.layers, record), here, record, suffix, u)
+                observe_explicit(outputs, record, suffix, last_integrated=last)
+            count_as_probabilities(at_limits(self.layers, record), outputs, suffix)
 
     def sample_states(self, suffix: str) -> dict[str, Tensor]:
         """Sample what past inputs left at the first sample of a record, by layer."""
-        states = {}
-        for one in self.state_sites:
-            assert isinstance(one.layer, Dynamic)
-            one_ = torch.ones(2 * one.layer.pairs, dtype=torch.float64)
-            name = f"{one.name}_initial_state{suffix}"
-            states[one.name] = pyro.sample(name, dist.Normal(0.0 * one_, one_).to_event(1))
-        return states
+        values = sample(self.state_sites_of(suffix))
+        return self.states_of(values, suffix)
 
-    def begin(self, system: CascadeSystem, states: Mapping[str, Tensor]) -> CascadeSystem:
-        """The cascade at the beginning of a record, as `initial_state` has it."""
+    def states_of(self, values: Mapping[str, Tensor], suffix: str) -> dict[str, Tensor]:
+        """Standard normal numbers (*b, 2P) behind the first state of a record, by layer."""
+        return {w.name: values[f"{w.name}_initial_state{suffix}"] for w in self.state_sites}
+
+    def begin(self, system: System, states: Mapping[str, Tensor]) -> System:
+        """The system at the beginning of a record, as `initial_state` has it."""
         if self.initial_state == "zero":
             zeros = {
-                one.name: torch.zeros(2 * one.layer.pairs, dtype=torch.float64)
-                for one in self.wires
-                if isinstance(one.layer, Dynamic)
+                w.name: torch.zeros(2 * layer.pairs, dtype=torch.float64)
+                for w, layer in self.dynamic
             }
             return system.after(zeros)
         return system.after(states)
-
-
-def support_points(locations: Tensor, count: int) -> Tensor:
-    """Points (*b, K, d) at which the rest of a function is drawn: over where inducing points lie.
-
-    One channel: an even grid. Several: the inducing locations spread by a Sobol sequence over
-    their box. No gradient passes.
-    """
-    z = locations.detach()
-    low, high = z.amin(-2, keepdim=True), z.amax(-2, keepdim=True)
-    margin = 0.1 * (high - low) + 1e-3
-    if z.shape[-1] == 1:
-        unit = torch.linspace(0.0, 1.0, count, dtype=torch.float64).unsqueeze(-1)
-    else:
-        engine = torch.quasirandom.SobolEngine(z.shape[-1])
-        unit = engine.draw(count, dtype=torch.float64)
-    return low - margin + (high - low + 2.0 * margin) * unit

@@ -17,10 +17,11 @@ so that g0 is the steady-state gain of the pair and g1 that of its derivative pa
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Literal
 
-import pyro
 import pyro.distributions as dist
 import torch
 from torch import Tensor
@@ -28,6 +29,8 @@ from torch import Tensor
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.distributions.decay import LogDecayRate
 from pyro_dynogp.distributions.shared_scale import SharedScaleNormal
+from pyro_dynogp.layers.sites import Site, Values, sample
+from pyro_dynogp.lti.covariance import real_covariance
 from pyro_dynogp.lti.modes import Modes, NoiseStructure
 from pyro_dynogp.support.errors import invalid
 
@@ -44,6 +47,10 @@ CRITICAL = 0.02
 SETTLING = 10.0
 # Standard deviation of a prior that is flat for all practical purposes.
 FLAT = 1e3
+# What is left of new noise gains where a model is extended: not nothing, since at zero the density
+# has no slope.
+QUIET = 0.05
+NO_NAMES: Mapping[str, str] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -83,35 +90,6 @@ def _complex(x: Tensor) -> Tensor:
     return torch.complex(x[..., 0], x[..., 1])
 
 
-def sample_poles(name: str, pairs: int, time_scale: TimeScale, priors: PriorName) -> Tensor:
-    """Sample P poles (*b, P) [1/s].
-
-    Sites: ``<name>_log_decay`` and ``<name>_log_frequency`` (P,), logarithms of -Re lambda and of
-    Im lambda over the typical rate of the record. Default: `LogDecayRate` up to the rate pi/step,
-    which all but excludes what hardly decays within the record; frequencies uniform from a tenth of
-    the rate 1/duration (as good as a real pole) to pi/step. Paper: flat.
-    """
-    low, high = time_scale.rate_bounds
-    if high <= low:
-        raise invalid("time_scale", expected="more than three samples", got=repr(time_scale))
-    if priors == "paper":
-        flat = _normal(FLAT, pairs)
-        log_decay = pyro.sample(f"{name}_log_decay", flat)
-        log_frequency = pyro.sample(f"{name}_log_frequency", flat)
-    else:
-        half = 0.5 * (high - low)
-        top = torch.full((pairs,), half, dtype=torch.float64)
-        settling = torch.full_like(top, SETTLING / math.exp(half))
-        log_decay = pyro.sample(f"{name}_log_decay", LogDecayRate(settling, top).to_event(1))
-        bottom = torch.full_like(top, -half - math.log(10.0))
-        log_frequency = pyro.sample(f"{name}_log_frequency", dist.Uniform(bottom, top).to_event(1))
-    decay = time_scale.typical_rate * log_decay.exp()
-    undamped = time_scale.typical_rate * log_frequency.exp()
-    # The floor is as good as a double real pole (relative error 4e-4) and keeps residues bounded.
-    frequency = (undamped.square() + (CRITICAL * decay).square()).sqrt()
-    return torch.complex(-decay, frequency)
-
-
 def residues(poles: Tensor, numerator: Tensor) -> Tensor:
     """Residue at each pole of (b1 s + b0) / ((s - lambda)(s - conj lambda)).
 
@@ -133,21 +111,183 @@ def numerators(poles: Tensor, residue: Tensor) -> Tensor:
     return torch.stack([2.0 * residue.real, b0], -1)
 
 
+def horseshoe_sites(
+    name: str, *shape: int, dims: tuple[str, ...], positive: bool = False, growth: float = 1.0
+) -> tuple[Site, Site]:
+    """Sites of a horseshoe over rows, hierarchical and non-centred.
+
+    ``<name>_local_scale`` (shape[0],) half-Cauchy(1) and ``<name>_unit`` standard normal, or
+    half-normal if `positive`. Their density is proper, unlike the horseshoe density itself, whose
+    mode at zero is infinite.
+
+    Source: Carvalho, Polson & Scott, Proc. AISTATS 5:73 (2009).
+    """
+    local = dist.HalfCauchy(torch.ones(shape[:1], dtype=torch.float64)).to_event(1)
+    ones = torch.ones(shape, dtype=torch.float64)
+    unit = dist.HalfNormal(ones) if positive else dist.Normal(0.0 * ones, ones)
+    return (
+        Site(f"{name}_local_scale", local, dims[:1]),
+        Site(f"{name}_unit", unit.to_event(len(shape)), dims, growth=growth),
+    )
+
+
+def horseshoe(name: str, values: Values, rank: int, scale: float = HORSESHOE_SCALE) -> Tensor:
+    """Scale * local * unit (*b, *shape), of the sites of `horseshoe_sites`; rank: of the shape."""
+    local, unit = values[f"{name}_local_scale"], values[f"{name}_unit"]
+    return scale * local.reshape(local.shape + (1,) * (rank - 1)) * unit
+
+
 def sample_horseshoe(
     name: str, *shape: int, scale: float = HORSESHOE_SCALE, positive: bool = False
 ) -> Tensor:
-    """Horseshoe of the given scale over rows: scale * local * z (*b, *shape).
+    """Sample a horseshoe of the given scale over rows (*b, *shape); see `horseshoe_sites`."""
+    dims = tuple(f"{name}_dim_{axis}" for axis in range(len(shape)))
+    sites = horseshoe_sites(name, *shape, dims=dims, positive=positive)
+    return horseshoe(name, sample(sites), len(shape), scale)
 
-    Hierarchical and non-centred (Carvalho, Polson & Scott 2009): sites ``<name>_local_scale``
-    (shape[0],) half-Cauchy(1) and ``<name>_unit`` standard normal, or half-normal if `positive`.
-    Its density is proper, unlike the horseshoe density itself, whose mode at zero is infinite.
+
+@dataclass(frozen=True)
+class ModesPrior:
+    """Prior of a stochastic LTI system for inputs and outputs of unit standard deviation.
+
+    It lists the sites and maps their values to `Modes`. Sites (all start with ``<name>_``), *
+    marking what depends on the options:
+
+    - ``log_decay``, ``log_frequency`` (P,): logarithms of -Re lambda and of Im lambda over the
+      typical rate of the record. Default: `LogDecayRate` up to the rate pi/step, which all but
+      excludes what hardly decays within the record; frequencies uniform from a tenth of the rate
+      1/duration (as good as a real pole) to pi/step. Paper: flat.
+    - ``input_gain`` (P, n_u, 2)*: g1 and g0 of each section (output per input). Those of one
+      input are normal around zero with a size of their own, unknown (`SharedScaleNormal`): pairs
+      that are not needed shrink, as do inputs that have no effect; a slow pair may have gains of
+      ten.
+    - ``feedthrough`` (n_y, n_u) or (n_u,)*: normal(0, 1).
+    - ``noise_gain_local_scale`` (P,), ``noise_gain_unit`` (P, n_l, 2)*: horseshoe of scale 0.1 on
+      n1 and n0 of the noise's sections (n1 s + n0 |lambda|) sqrt(4 r) / (...), r the typical rate
+      of the record: the standard deviation of the output of a pair that decays at that rate. The
+      prior is on the intensity of the noise (as the paper's), so that a pair so fast that it would
+      imitate measurement noise needs a large, unlikely one. Where only the squares of n1 and n0
+      matter (one output; one pair, or independent noise; n_l = 1) they are positive.
+    - ``output_gain`` (n_y, P, 2)*: direction of c, only for several outputs; normal(0, 1).
+
+    Attributes:
+        name: prefix of the sites.
+        inputs: n_u. pairs: P.
+        outputs: n_y for modes with an output dimension; None for a single output without one.
+        brownian: n_l, number of Brownian motions (for each pair, if independent).
+        noise: "shared" or "independent", see `Modes`.
+        feedthrough: whether there is a direct path D.
+        process_noise: whether there is process noise at all.
+        time_scale: step and duration of the record [s].
+        gain_scale: of the gains of an input a priori.
+        priors: "default", or "paper" for flat ones but for the horseshoe.
+
+    Raises:
+        ValueError: on unknown priors, or a record of three samples or fewer.
     """
-    one = torch.ones(shape[:1], dtype=torch.float64)
-    local = pyro.sample(f"{name}_local_scale", dist.HalfCauchy(one).to_event(1))
-    ones = torch.ones(shape, dtype=torch.float64)
-    prior = dist.HalfNormal(ones) if positive else dist.Normal(0.0 * ones, ones)
-    unit = pyro.sample(f"{name}_unit", prior.to_event(len(shape)))
-    return scale * local.reshape(local.shape + (1,) * (len(shape) - 1)) * unit
+
+    name: str
+    inputs: int
+    pairs: int
+    outputs: int | None = None
+    brownian: int = 1
+    noise: NoiseStructure = "shared"
+    feedthrough: bool = True
+    process_noise: bool = True
+    time_scale: TimeScale = TimeScale(1.0, 1000.0)
+    gain_scale: float = GAIN_SCALE
+    priors: PriorName = "default"
+
+    def __post_init__(self) -> None:
+        if self.priors not in ("default", "paper"):
+            raise invalid("priors", expected="'default' or 'paper'", got=repr(self.priors))
+        low, high = self.time_scale.rate_bounds
+        if high <= low:
+            expected = "more than three samples"
+            raise invalid("time_scale", expected=expected, got=repr(self.time_scale))
+
+    def sites(self, dims: Mapping[str, str] = NO_NAMES) -> tuple[Site, ...]:
+        """The sites, in the order in which they are sampled.
+
+        Args:
+            dims: names of dimensions ("pair", "input", "output", "brownian") where they are others.
+        """
+
+        def named(*generic: str) -> tuple[str, ...]:
+            return tuple(dims.get(dim, dim) for dim in generic)
+
+        name, P, n_u = self.name, self.pairs, self.inputs
+        flat = self.priors == "paper"
+        sites = [*self._pole_sites(named("pair"))]
+        if n_u:
+            gain = (
+                _normal(FLAT, P, n_u, 2)
+                if flat
+                else SharedScaleNormal(GAIN_FREEDOM, self.gain_scale, (P, n_u, 2), apart=1)
+            )
+            over = named("pair", "input", "term")
+            sites.append(Site(f"{name}_input_gain", gain, over, growth=0.0))
+            if self.feedthrough:
+                shape = (n_u,) if self.outputs is None else (self.outputs, n_u)
+                over = named("input") if self.outputs is None else named("output", "input")
+                direct = _normal(FLAT if flat else 1.0, *shape)
+                sites.append(Site(f"{name}_feedthrough", direct, over, growth=0.0))
+        if self.process_noise:
+            # The sign of a Brownian motion, and of a zero, cannot be seen in a covariance.
+            single = self.pairs == 1 or self.noise == "independent"
+            sites += horseshoe_sites(
+                f"{name}_noise_gain", P, self.brownian, 2,
+                dims=named("pair", "brownian", "term"),
+                positive=self.outputs is None and self.brownian == 1 and single,
+                growth=QUIET,
+            )  # fmt: skip
+        if self.outputs is not None:
+            direction = _normal(1.0, self.outputs, P, 2)
+            over = named("output", "pair", "part")
+            sites.append(Site(f"{name}_output_gain", direction, over))
+        return tuple(sites)
+
+    def _pole_sites(self, dims: tuple[str, ...]) -> tuple[Site, Site]:
+        low, high = self.time_scale.rate_bounds
+        if self.priors == "paper":
+            decay = frequency = _normal(FLAT, self.pairs)
+        else:
+            half = 0.5 * (high - low)
+            top = torch.full((self.pairs,), half, dtype=torch.float64)
+            settling = torch.full_like(top, SETTLING / math.exp(half))
+            decay = LogDecayRate(settling, top).to_event(1)
+            bottom = torch.full_like(top, -half - math.log(10.0))
+            frequency = dist.Uniform(bottom, top).to_event(1)
+        return (
+            Site(f"{self.name}_log_decay", decay, dims),
+            Site(f"{self.name}_log_frequency", frequency, dims),
+        )
+
+    def modes(self, values: Values) -> Modes:
+        """Poles and gains at values (*b, *shape) of the sites; batch shape *b."""
+        name = self.name
+        rate = self.time_scale.typical_rate
+        decay = rate * values[f"{name}_log_decay"].exp()
+        undamped = rate * values[f"{name}_log_frequency"].exp()
+        # The floor is as good as a double real pole (relative error 4e-4); residues stay finite.
+        frequency = (undamped.square() + (CRITICAL * decay).square()).sqrt()
+        poles = torch.complex(-decay, frequency)
+        B = L = None
+        if self.inputs:
+            gain = values[f"{name}_input_gain"]
+            B = residues(poles, _section(poles, gain) * poles.abs()[..., None, None])
+        if self.process_noise:
+            share = horseshoe(f"{name}_noise_gain", values, 3)
+            L = residues(poles, _section(poles, share) * math.sqrt(4.0 * rate))
+        if self.outputs is None:
+            c = torch.ones(self.pairs, dtype=torch.complex128)
+            c = c.expand(poles.shape)
+        else:
+            c = unit_direction(_complex(values[f"{name}_output_gain"]))
+        D = values.get(f"{name}_feedthrough")
+        return Modes(
+            poles=poles, input_gain=B, output_gain=c, noise_gain=L, feedthrough=D, noise=self.noise
+        )
 
 
 def sample_modes(
@@ -166,74 +306,26 @@ def sample_modes(
 ) -> Modes:
     """Sample a stochastic LTI system, for inputs and outputs of unit standard deviation.
 
-    Sites (all start with ``<name>_``), * marking what depends on the options:
-
-    - ``log_decay``, ``log_frequency`` (P,): see `sample_poles`.
-    - ``input_gain`` (P, n_u, 2)*: g1 and g0 of each section (output per input). Those of one
-      input are normal around zero with a size of their own, unknown (`SharedScaleNormal`): pairs
-      that are not needed shrink, as do inputs that have no effect; a slow pair may have gains of
-      ten.
-    - ``output_gain`` (n_y, P, 2)*: direction of c, only for several outputs; normal(0, 1).
-    - ``noise_gain_local_scale`` (P,), ``noise_gain_unit`` (P, n_l, 2)*: horseshoe of scale 0.1 on
-      n1 and n0 of the noise's sections (n1 s + n0 |lambda|) sqrt(4 r) / (...), r the typical rate
-      of the record: the standard deviation of the output of a pair that decays at that rate. The
-      prior is on the intensity of the noise (as the paper's), so that a pair so fast that it would
-      imitate measurement noise needs a large, unlikely one. Where only the squares of n1 and n0
-      matter (one output; one pair, or independent noise; n_l = 1) they are positive.
-    - ``feedthrough`` (n_y, n_u) or (n_u,)*: normal(0, 1).
-
-    Args:
-        name: prefix of the sites.
-        inputs: n_u. pairs: P.
-        outputs: n_y for modes with an output dimension; None for a single output without one.
-        brownian: n_l, number of Brownian motions (for each pair, if independent).
-        noise: "shared" or "independent", see `Modes`.
-        feedthrough: whether there is a direct path D.
-        process_noise: whether there is process noise at all.
-        time_scale: step and duration of the record [s]; by default time is counted in samples of
-            a record of 1000.
-        gain_scale: of the gains of an input a priori.
-        priors: "default", or "paper" for flat ones but for the horseshoe.
+    Args: as the attributes of `ModesPrior`, which lists the sites.
+        time_scale: by default time is counted in samples of a record of 1000.
 
     Returns:
         Modes with the batch shape of the sites (particles).
+
+    Raises:
+        ValueError: on unknown priors, or a record of three samples or fewer.
     """
-    if priors not in ("default", "paper"):
-        raise invalid("priors", expected="'default' or 'paper'", got=repr(priors))
-    scale = time_scale or TimeScale(1.0, 1000.0)
-    poles = sample_poles(name, pairs, scale, priors)
-    flat = priors == "paper"
-    B = L = D = None
-    if inputs:
-        gain = _input_gain(f"{name}_input_gain", pairs, inputs, None if flat else gain_scale)
-        B = residues(poles, _section(poles, gain) * poles.abs()[..., None, None])
-        if feedthrough:
-            shape = (inputs,) if outputs is None else (outputs, inputs)
-            D = pyro.sample(f"{name}_feedthrough", _normal(FLAT if flat else 1.0, *shape))
-    if process_noise:
-        # The sign of a Brownian motion, and of a zero, cannot be seen in a covariance.
-        alone = outputs is None and brownian == 1 and (pairs == 1 or noise == "independent")
-        share = sample_horseshoe(f"{name}_noise_gain", pairs, brownian, 2, positive=alone)
-        L = residues(poles, _section(poles, share) * math.sqrt(4.0 * scale.typical_rate))
-    if outputs is None:
-        c = torch.ones(pairs, dtype=torch.complex128)
-        c = c.expand(poles.shape)
-    else:
-        raw = _complex(pyro.sample(f"{name}_output_gain", _normal(1.0, outputs, pairs, 2)))
-        c = unit_direction(raw)
-    return Modes(poles=poles, input_gain=B, output_gain=c, noise_gain=L, feedthrough=D, noise=noise)
+    prior = ModesPrior(
+        name, inputs, pairs, outputs, brownian, noise, feedthrough, process_noise,
+        time_scale or TimeScale(1.0, 1000.0), gain_scale, priors,
+    )  # fmt: skip
+    return prior.modes(sample(prior.sites()))
 
 
-def sample_direct(columns: int, outputs: int, *, flat: bool = False) -> Tensor:
-    """Weights (*b, n_y, K) of inputs that act on the output at once, site ``direct``."""
-    return pyro.sample("direct", _normal(FLAT if flat else 1.0, outputs, columns))
-
-
-def _input_gain(name: str, pairs: int, inputs: int, scale: float | None) -> Tensor:
-    """Gains (*b, P, n_u, 2) of all sections; flat without a scale."""
-    if scale is None:
-        return pyro.sample(name, _normal(FLAT, pairs, inputs, 2))
-    return pyro.sample(name, SharedScaleNormal(GAIN_FREEDOM, scale, (pairs, inputs, 2), apart=1))
+def direct_site(columns: int, outputs: int, *, flat: bool = False) -> Site:
+    """Weights (n_y, K) of inputs that act on the output at once, site ``direct``."""
+    prior = _normal(FLAT if flat else 1.0, outputs, columns)
+    return Site("direct", prior, ("output", "direct input"), growth=0.0)
 
 
 def _section(poles: Tensor, gain: Tensor) -> Tensor:
@@ -247,3 +339,39 @@ def unit_direction(raw: Tensor) -> Tensor:
     first = raw[..., :1, :]
     turned = raw * (first.conj() / first.abs())
     return turned / raw.abs().square().sum(-2, keepdim=True).sqrt()
+
+
+def with_direct(modes: Modes, weights: Tensor) -> Modes:
+    """The system with more inputs, which act on the output alone: weights (*b, n_y, K)."""
+    B, D = modes.B, modes.D
+    silent = torch.zeros((*B.shape[:-1], weights.shape[-1]), dtype=B.dtype)
+    batch = torch.broadcast_shapes(D.shape[:-1], weights.shape[:-1])
+    joined = torch.cat([part.expand((*batch, part.shape[-1])) for part in (D, weights)], -1)
+    if not modes.several_outputs:
+        joined = joined.squeeze(-2)
+    return replace(modes, input_gain=torch.cat([B, silent], -1), feedthrough=joined)
+
+
+def past_input_covariance(modes: Modes, memory: float) -> Tensor:
+    """Covariance (*b, 2P, 2P) of [Re x; Im x] after unknown past inputs of unit variance.
+
+    Each input is taken as the sum of a random constant, which holds the state at -B/lambda, and
+    of white noise of intensity 2 memory, as of an input that forgets within `memory` [s].
+    """
+    lam, B = modes.poles, modes.B
+    held = B / lam.unsqueeze(-1)
+    hermitian = held @ held.mH - 2.0 * memory * (B @ B.mH) / (
+        lam.unsqueeze(-1) + lam.conj().unsqueeze(-2)
+    )
+    symmetric = held @ held.mT - 2.0 * memory * (B @ B.mT) / (lam.unsqueeze(-1) + lam.unsqueeze(-2))
+    return real_covariance(hermitian, symmetric)
+
+
+def initial_mean(covariance: Tensor, standard: Tensor) -> Tensor:
+    """Initial state (*b, P), complex, with the given covariance, from standard normals (*b, 2P)."""
+    J = covariance.shape[-1]
+    ridge = 1e-9 * covariance.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] + 1e-150
+    eye = torch.eye(J, dtype=covariance.dtype)
+    root = torch.linalg.cholesky(covariance + ridge * eye)
+    x = (root @ standard.unsqueeze(-1)).squeeze(-1)
+    return torch.complex(x[..., : J // 2], x[..., J // 2 :])

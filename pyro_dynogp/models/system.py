@@ -1,9 +1,9 @@
-"""The layers of a cascade given their parameters."""
+"""The layers of a model given their parameters."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -17,9 +17,9 @@ from pyro_dynogp.layers.noise import Noise
 from pyro_dynogp.lti.covariance import state_covariance
 from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.lti.modes import Modes
-from pyro_dynogp.lti.response import mean_response
+from pyro_dynogp.lti.response import Response, mean_response
 from pyro_dynogp.lti.state import ModalState
-from pyro_dynogp.models.linear import initial_mean
+from pyro_dynogp.models.priors import initial_mean, past_input_covariance, with_direct
 from pyro_dynogp.models.wiring import INPUTS, Wire
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.tensors import as_tensor, broadcast
@@ -31,27 +31,48 @@ class DynamicSystem:
 
     Attributes:
         modes: poles and gains.
-        past_inputs: (*b, 2P, 2P) covariance that unknown past inputs give the first state.
+        past: (*b, 2P, 2P) covariance that unknown past inputs give the first state; or for how long
+            inputs are alike [time], from which it follows.
         first_state: (*b, P) complex, what past inputs left at the first sample of the record at
             hand; None where it is not known.
     """
 
     modes: Modes
-    past_inputs: Tensor
+    past: Tensor | float
     first_state: Tensor | None = None
 
-    def prior_state(self, process_noise: bool = True) -> ModalState:
+    @cached_property
+    def past_inputs(self) -> Tensor:
+        """Covariance (*b, 2P, 2P) that unknown past inputs give the first state."""
+        if isinstance(self.past, Tensor):
+            return self.past
+        return past_input_covariance(self.modes, self.past)
+
+    @property
+    def is_known(self) -> bool:
+        """Whether known inputs determine the trajectory: no process noise, first state known."""
+        return self.first_state is not None and not self.modes.has_process_noise
+
+    @property
+    def without_process_noise(self) -> DynamicSystem:
+        """The same layer with deterministic dynamics."""
+        return replace(self, modes=self.modes.without_process_noise(), past=self.past_inputs)
+
+    def prior_state(self) -> ModalState:
         """Gaussian state at the first sample: what past inputs left, and past process noise."""
-        modes = self.modes if process_noise else self.modes.without_process_noise()
-        covariance = state_covariance(modes)
         if self.first_state is not None:
-            return ModalState(self.first_state, covariance)
-        return ModalState(torch.zeros_like(modes.poles), covariance + self.past_inputs)
+            return ModalState(self.first_state, state_covariance(self.modes))
+        past = self.past_inputs
+        return ModalState(torch.zeros_like(self.modes.poles), state_covariance(self.modes) + past)
+
+    def response(self, x: Tensor, time: Any) -> Response:
+        """What x (*b, n, d) alone causes, from the known first state or rest."""
+        driven = x if self.modes.inputs else None
+        return mean_response(self.modes, time, driven, self.first_state)
 
     def mean(self, x: Tensor, time: Any) -> Tensor:
         """Output (*b, n, w) that x (*b, n, d) alone causes, from the known first state or rest."""
-        driven = x if self.modes.inputs else None
-        value = mean_response(self.modes, time, driven, self.first_state).output
+        value = self.response(x, time).output
         return value if self.modes.several_outputs else value.unsqueeze(-1)
 
     def after(self, standard: Tensor) -> DynamicSystem:
@@ -85,7 +106,24 @@ class StaticSystem:
 
 
 @dataclass(frozen=True, eq=False)
-class CascadeSystem:
+class PhysicalSystem:
+    """A linear system with its noise in the units of the record; batch shape *b.
+
+    Its state is that of the scaled system: units of inputs and outputs are in the gains.
+
+    Attributes:
+        modes: poles and gains of all inputs, direct ones too.
+        offset: (*b,) or (*b, n_y): mean output at the mean inputs of the training record.
+        noise_sd: (*b,) or (*b, n_y): measurement noise [output]; None where it varies.
+    """
+
+    modes: Modes
+    offset: Tensor
+    noise_sd: Tensor | None
+
+
+@dataclass(frozen=True, eq=False)
+class System:
     """All layers given their parameters, in units of the scaled record.
 
     Attributes:
@@ -99,6 +137,7 @@ class CascadeSystem:
     noise: Noise
     offset: Tensor | None
     direct: Tensor | None = None
+    _in_units: tuple[Scaling, PhysicalSystem] | None = field(default=None, init=False, repr=False)
 
     @cached_property
     def batch_shape(self) -> torch.Size:
@@ -152,15 +191,77 @@ class CascadeSystem:
             return self.noise.sd(self.undisturbed(inputs, time))
         return self.noise.sd(self.driving(inputs))
 
-    def after(self, states: Mapping[str, Tensor]) -> CascadeSystem:
-        """The cascade after past inputs, given by standard normal numbers (*b, 2P) by layer."""
+    def after(self, states: Mapping[str, Tensor]) -> System:
+        """The system after past inputs, given by standard normal numbers (*b, 2P) by layer."""
+        if not states:
+            return self
+        return self.with_layers(
+            lambda wire, layer: layer.after(states[wire.name]) if wire.name in states else layer
+        )
+
+    @property
+    def without_process_noise(self) -> System:
+        """The same system with deterministic dynamics."""
+        return self.with_layers(lambda wire, layer: layer.without_process_noise)
+
+    def with_layers(self, change: Callable[[Wire, DynamicSystem], DynamicSystem]) -> System:
+        """The system with other dynamic layers."""
         layers = tuple(
-            layer.after(states[one.name])
-            if isinstance(layer, DynamicSystem) and one.name in states
-            else layer
-            for one, layer in zip(self.wires, self.layers, strict=True)
+            change(wire, layer) if isinstance(layer, DynamicSystem) else layer
+            for wire, layer in zip(self.wires, self.layers, strict=True)
         )
         return replace(self, layers=layers)
+
+    @property
+    def dynamic(self) -> tuple[tuple[Wire, DynamicSystem], ...]:
+        """The dynamic layers with their places, first to last."""
+        pairs = zip(self.wires, self.layers, strict=True)
+        return tuple((wire, layer) for wire, layer in pairs if isinstance(layer, DynamicSystem))
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether it is one layer of linear dynamics, whatever the noise."""
+        return len(self.layers) == 1 and isinstance(self.layers[0], DynamicSystem)
+
+    def physical(self, scaling: Scaling) -> PhysicalSystem:
+        """One layer of linear dynamics, with its direct inputs, in the units of the record.
+
+        Computed once: several records share it, and its gradient.
+
+        Raises:
+            ValueError: for other systems, whose layers have scales of their own.
+        """
+        if self._in_units is None or self._in_units[0] is not scaling:
+            object.__setattr__(self, "_in_units", (scaling, self._physical(scaling)))
+        assert self._in_units is not None
+        return self._in_units[1]
+
+    def _physical(self, scaling: Scaling) -> PhysicalSystem:
+        (layer, *more) = self.layers
+        if more or not isinstance(layer, DynamicSystem):
+            raise invalid(
+                "modes",
+                expected="a model that is one layer of linear dynamics",
+                got="layers that have modes of their own, or none",
+                advice='Use fit.system.layer("g").modes.',
+            )
+        assert self.offset is not None
+        modes = layer.modes if self.direct is None else with_direct(layer.modes, self.direct)
+        y_scale, y_offset = as_tensor(scaling.output_scale), as_tensor(scaling.output_offset)
+        sd = self.noise.constant_sd
+        several = modes.several_outputs
+
+        def outputs(x: Tensor) -> Tensor:
+            return x if several else x.squeeze(-1)
+
+        level, noise = y_offset + y_scale * self.offset, None if sd is None else y_scale * sd
+        return PhysicalSystem(
+            modes=modes.rescale(
+                inputs=as_tensor(scaling.input_scale), outputs=y_scale if several else y_scale[0]
+            ),
+            offset=outputs(level),
+            noise_sd=None if noise is None else outputs(noise),
+        )
 
     def layer(self, name: str) -> DynamicSystem | StaticSystem:
         """The system of a layer by name.

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 from pyro_dynogp.data.channels import Channel, count_direct
-from pyro_dynogp.inference.methods.mode import deterministic
 from pyro_dynogp.layers.noise import Likelihood
-from pyro_dynogp.models.linear import LinearDynamicGP
-from pyro_dynogp.models.model import Cascade
-from pyro_dynogp.models.wiring import Dynamic, Limits, Static
+from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.wiring import Dynamic, Limits, Static, Wire
 
-Model = LinearDynamicGP | Cascade
 # Inducing values of a function that is added.
 INDUCING = 32
 
@@ -38,67 +36,47 @@ def without_channel(model: Model, channel: Channel) -> Model:
     )
 
 
-def with_pairs(model: Model, count: int) -> Model:
-    """The model with more pairs of poles in every dynamic layer."""
-    if isinstance(model, LinearDynamicGP):
-        return replace(model, pairs=model.pairs + count)
+def with_dynamics(model: Model, change: Callable[[Wire, Dynamic], Dynamic]) -> Model:
+    """The model with other dynamic layers."""
     layers = tuple(
-        replace(layer, pairs=layer.pairs + count) if isinstance(layer, Dynamic) else layer
-        for layer in model.layers
+        change(wire, layer) if isinstance(layer, Dynamic) else layer
+        for wire, layer in zip(model.wires, model.layers, strict=True)
     )
     return replace(model, layers=layers)
+
+
+def with_pairs(model: Model, count: int) -> Model:
+    """The model with more pairs of poles in every dynamic layer."""
+    return with_dynamics(model, lambda _, layer: replace(layer, pairs=layer.pairs + count))
 
 
 def with_process_noise(model: Model) -> Model:
     """The model with process noise in every dynamic layer."""
-    if isinstance(model, LinearDynamicGP):
-        return replace(model, process_noise=True)
-    layers = tuple(
-        replace(layer, process_noise=True) if isinstance(layer, Dynamic) else layer
-        for layer in model.layers
-    )
-    return replace(model, layers=layers)
+    return with_dynamics(model, lambda _, layer: replace(layer, process_noise=True))
 
 
 def without_process_noise(model: Model) -> Model:
     """The model with deterministic dynamics, but where process noise is all that drives them."""
-    if isinstance(model, LinearDynamicGP):
-        driven = model.inputs > model.direct
-        return replace(model, process_noise=False) if driven else model
-    return deterministic(model)
+    return with_dynamics(
+        model,
+        lambda wire, layer: replace(layer, process_noise=False) if wire.channels else layer,
+    )
+
+
+def without_noise_below_functions(model: Model) -> Model:
+    """The model with deterministic dynamics; the same one where no static layer sees noise.
+
+    Layers that nothing else drives keep their process noise.
+    """
+    static = [place for place, layer in enumerate(model.layers) if isinstance(layer, Static)]
+    below = model.layers[: static[-1] if static else 0]
+    seen = any(isinstance(layer, Dynamic) and layer.process_noise for layer in below)
+    return without_process_noise(model) if seen else model
 
 
 def has_process_noise(model: Model) -> bool:
     """Whether every dynamic layer has process noise."""
-    if isinstance(model, LinearDynamicGP):
-        return model.process_noise
-    return all(one.process_noise for one in model.layers if isinstance(one, Dynamic))
-
-
-def has_function(model: Model) -> bool:
-    """Whether there is a static layer."""
-    return isinstance(model, Cascade) and any(isinstance(one, Static) for one in model.layers)
-
-
-def as_cascade(model: Model) -> Cascade:
-    """A linear model as a cascade of one dynamic layer; a cascade as it is."""
-    if isinstance(model, Cascade):
-        return model
-    layer = Dynamic(
-        outputs=model.outputs,
-        pairs=model.pairs,
-        noise=model.noise,
-        brownian=model.brownian,
-        feedthrough=model.feedthrough,
-        process_noise=model.process_noise,
-    )
-    return Cascade(
-        model.inputs,
-        (layer,),
-        direct=model.direct,
-        channels=model.channels,
-        priors=model.priors,
-    )
+    return all(layer.process_noise for _, layer in model.dynamic)
 
 
 def with_output_function(model: Model, limits: Limits | None = None) -> Model | None:
@@ -107,26 +85,24 @@ def with_output_function(model: Model, limits: Limits | None = None) -> Model | 
     Its prior mean is a straight line, to which it goes back beyond the data; or one that stops at
     limits [output].
     """
-    cascade = as_cascade(model)
-    if isinstance(cascade.layers[-1], Static):
+    if isinstance(model.layers[-1], Static):
         return None
-    last = Static(outputs=cascade.outputs, inducing=INDUCING, mean="linear", limits=limits)
-    return replace(cascade, layers=(*cascade.layers, last), scaling=None)
+    last = Static(outputs=model.outputs, inducing=INDUCING, mean="linear", limits=limits)
+    return replace(model, layers=(*model.layers, last), scaling=None)
 
 
 def with_input_function(model: Model) -> Model | None:
     """The model with a static layer before its first dynamic one; None where there is one."""
-    cascade = as_cascade(model)
-    driving = cascade.inputs - cascade.direct
-    if isinstance(cascade.layers[0], Static) or not driving:
+    driving = model.inputs - model.direct
+    if isinstance(model.layers[0], Static) or not driving:
         return None
     first = Static(outputs=driving, inducing=INDUCING)
-    return replace(cascade, layers=(first, *cascade.layers), scaling=None)
+    return replace(model, layers=(first, *model.layers), scaling=None)
 
 
 def with_likelihood(model: Model, likelihood: Likelihood) -> Model:
     """The model with other measurement noise."""
-    return replace(as_cascade(model), likelihood=likelihood, scaling=None)
+    return replace(model, likelihood=likelihood, scaling=None)
 
 
 def used_channels(model: Model) -> set[str]:

@@ -79,7 +79,7 @@ class Wire:
         name: of the layer. layer: its specification, nothing left to default.
         sources: names of the signals it sees, in order. channels: how many they are.
         pathwise: whether a dynamic layer sees its output, directly or through static layers.
-        last: whether it is the last.
+        last: whether it is the last. single: whether no other layer is of its kind.
     """
 
     name: str
@@ -88,6 +88,22 @@ class Wire:
     channels: int
     pathwise: bool
     last: bool
+    single: bool = True
+
+    @property
+    def dims(self) -> dict[str, str]:
+        """Names of the dimensions of the layer's sites, by what they are in any layer.
+
+        Inputs and outputs of the model are "input" and "output"; dimensions that another layer of
+        the kind has with another length carry the layer's name.
+        """
+        names = {
+            "input": "input" if self.sources == (INPUTS,) else f"{self.name}_input",
+            "output": "output" if self.last else f"{self.name}_output",
+        }
+        for dim in ("pair", "brownian", "state", "inducing", "support"):
+            names[dim] = dim if self.single else f"{self.name}_{dim}"
+        return names
 
     @property
     def described(self) -> str:
@@ -135,7 +151,8 @@ def wire(inputs: int, layers: Sequence[Layer]) -> tuple[Wire, ...]:
                 got="False",
             )
         last = place == len(layers) - 1
-        wires.append(Wire(name, layer, sources, channels, False, last))
+        single = sum(type(other) is type(layer) for other in layers) == 1
+        wires.append(Wire(name, layer, sources, channels, False, last, single))
         width[name] = layer.outputs
         before = name
     feeds: set[str] = set()

@@ -1,4 +1,4 @@
-"""The first state of a record that a fitted cascade is used on."""
+"""The first state of a record that a fitted model is used on."""
 
 from __future__ import annotations
 
@@ -10,10 +10,8 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.models.model import Cascade
-from pyro_dynogp.models.outputs import collapsed_of
-from pyro_dynogp.models.system import CascadeSystem
-from pyro_dynogp.models.wiring import Dynamic
+from pyro_dynogp.models.outputs import output_process
+from pyro_dynogp.models.system import System
 
 if TYPE_CHECKING:
     from pyro_dynogp.inference.fitted import Fit
@@ -22,42 +20,59 @@ if TYPE_CHECKING:
 SAMPLES = 400
 
 
-def cascade_of(fit: Fit) -> Cascade:
-    """The fitted cascade."""
-    assert isinstance(fit.model, Cascade)
-    return fit.model
+def unknown_beginning(fit: Fit) -> System:
+    """The fitted system after past inputs of which nothing is known."""
+    return fit.model.begin(fit.system, {})
 
 
-def beginning(fit: Fit, record: Record) -> CascadeSystem:
-    """The fitted cascade at the beginning of a record, ready for the filter.
+def beginning(fit: Fit, record: Record, *, predicting: bool = False) -> System:
+    """The fitted system at the beginning of a record.
 
-    On a training record the first state is that of the posterior draws. On another record it is
-    estimated from the record's first samples: the mode of the numbers that describe it, at the
-    mode of the parameters.
+    On a training record the first state is that of the posterior draws. On another record that of
+    layers which a static layer sees is estimated from the record's first samples: the mode of the
+    numbers that describe it, at the mode of the parameters. (For others it is integrated out.)
+
+    Args:
+        fit: the fit. record: prepared, along which.
+        predicting: whether first states that can be integrated out are unknown on training
+            records, too: predictions serve every record in the same way.
     """
-    model = cascade_of(fit)
-    sites = model.state_sites
-    if not sites or not record.n_outputs:
-        return model.begin(fit.system, {})
-    if record.fingerprint in fit.training:
-        index = fit.training.index(record.fingerprint)
-        suffix = "" if len(fit.training) == 1 else f"_{index}"
-        names = {one.name: f"{one.name}_initial_state{suffix}" for one in sites}
-        return model.begin(fit.system, {k: fit.draws[v] for k, v in names.items()})
-    return model.begin(fit.system, estimate(fit, record))
+    model = fit.model
+    if not model.state_sites or not record.n_outputs:
+        return unknown_beginning(fit)
+    index = training_index(fit, record)
+    if index is not None:
+        states = model.states_of(fit.draws, "" if len(fit.records) == 1 else f"_{index}")
+    else:
+        states = estimate(fit, record)
+    if predicting:
+        needed = {wire.name for wire in model.seen_by_functions}
+        states = {name: state for name, state in states.items() if name in needed}
+    return model.begin(fit.system, states)
+
+
+def training_index(fit: Fit, record: Record) -> int | None:
+    """Index of a record among the training records, as measured or as the model sees them."""
+    for index, known in enumerate(fit.records):
+        if record.fingerprint in (known.fingerprint, fit.model.check(known)[0].fingerprint):
+            return index
+    return None
 
 
 def estimate(fit: Fit, record: Record) -> dict[str, Tensor]:
-    """Most probable first state of a record, as standard normal numbers (2P,) by layer."""
-    model = cascade_of(fit)
+    """Most probable first state of a record, as standard normal numbers (2P,) by layer.
+
+    Of layers that a static layer sees.
+    """
+    model = fit.model
     head = record[: min(SAMPLES, len(record))]
-    system = fit._system_at(fit.mode)
+    system = fit.system_at(fit.mode)
     y = head.tensors().observations
-    sizes = {}
-    for one in model.state_sites:
-        assert isinstance(one.layer, Dynamic)
-        sizes[one.name] = 2 * one.layer.pairs
+    seen = model.seen_by_functions
+    sizes = {wire.name: 2 * layer.pairs for wire, layer in model.dynamic if wire in seen}
     total = sum(sizes.values())
+    if not total:
+        return {}
 
     def split(z: Tensor) -> dict[str, Tensor]:
         return dict(zip(sizes, torch.split(z, list(sizes.values())), strict=True))
@@ -65,8 +80,8 @@ def estimate(fit: Fit, record: Record) -> dict[str, Tensor]:
     def energy(x: np.ndarray) -> tuple[float, np.ndarray]:
         with torch.enable_grad():  # predictions are made without
             z = torch.tensor(x, requires_grad=True)
-            here = model.begin(system, split(z))
-            value = 0.5 * z.square().sum() - collapsed_of(here, fit.scaling, head).log_prob(y)
+            outputs = output_process(model.begin(system, split(z)), fit.scaling, head)
+            value = 0.5 * z.square().sum() - outputs.log_prob(y)
             (gradient,) = torch.autograd.grad(value, z)
         return float(value.detach()), gradient.numpy()
 

@@ -1,4 +1,4 @@
-"""What the layers of a fitted cascade do along a record: their signals and functions."""
+"""What the layers of a fitted model do along a record: their signals and functions."""
 
 from __future__ import annotations
 
@@ -9,12 +9,9 @@ import numpy as np
 import torch
 
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.lti.grid import time_grid
-from pyro_dynogp.models.assembly import Assembly, assemble
-from pyro_dynogp.models.system import DynamicSystem, scaled_inputs, scaled_outputs
-from pyro_dynogp.moments import filtering, smoothing
-from pyro_dynogp.moments.problem import FilterProblem, each
-from pyro_dynogp.prediction.first_state import beginning, cascade_of
+from pyro_dynogp.models.outputs import output_process
+from pyro_dynogp.models.system import DynamicSystem, scaled_inputs
+from pyro_dynogp.prediction.first_state import beginning
 from pyro_dynogp.prediction.records import one_record
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.tensors import as_tensor
@@ -46,54 +43,15 @@ def layers(fit: Fit, record: Record) -> dict[str, LayerTrajectory]:
     """Smoothed trajectories of all layers given a record's inputs and outputs."""
     record = one_record(fit, record)
     with torch.no_grad():
-        inputs = scaled_inputs(fit.scaling, record)
-        assembly = assemble(beginning(fit, record), time_grid(record.time), inputs)
-        y = scaled_outputs(fit.scaling, record) if record.n_outputs else None
-        problem = assembly.problem if y is None else assembly.with_outputs(y)
-        return smoothed_layers(assembly, problem, record.time)
-
-
-def smoothed_layers(
-    assembly: Assembly, problem: FilterProblem, time: np.ndarray
-) -> dict[str, LayerTrajectory]:
-    """Mean and sd of every signal of a cascade given the outputs of the problem."""
-    elements, batch = problem.elements()
-    A = problem.G.shape[-1]
-    names, widths, rows = [], [], []
-    for name, signal in assembly.signals.items():
-        if signal.rows is None:
-            continue
-        names.append(name)
-        widths.append(signal.rows.shape[-2])
-        rows.append(signal.rows.expand(*batch, widths[-1], A).reshape(-1, widths[-1], A))
-    nothing = torch.zeros(len(elements), 0, A, dtype=torch.float64)
-    joined = (torch.cat(rows, -2) if rows else nothing).contiguous().numpy()
-
-    def one(b: int) -> tuple[np.ndarray, np.ndarray]:
-        _, means, covariances, _, _ = filtering.run(problem.layout, elements[b])
-        mean, variance = smoothing.smooth(
-            problem.layout, elements[b], joined[b], means, covariances
+        outputs = output_process(beginning(fit, record), fit.scaling, record)
+        smoothed = outputs.smooth(record.tensors().observations if record.n_outputs else None)
+    found = {}
+    for name, layer in smoothed.items():
+        sd = np.sqrt((layer.sd**2).mean(0) + layer.mean.var(0))
+        found[name] = LayerTrajectory(
+            name, record.time, layer.mean.mean(0), sd, layer.mean, layer.sd
         )
-        return mean @ joined[b].T, variance
-
-    found = each(one, len(elements))
-    mean = np.stack([m for m, _ in found])
-    sd = np.sqrt(np.stack([v for _, v in found]))
-    out, start = {}, 0
-    for name, signal in assembly.signals.items():
-        n, w = signal.known.shape[-2:]
-        known = signal.known.expand(*batch, n, w).reshape(-1, n, w).numpy()
-        if signal.rows is None:
-            draw_mean, draw_sd = known, np.zeros_like(known)
-        else:
-            own = slice(start, start + w)
-            draw_mean, draw_sd = known + mean[..., own], sd[..., own]
-            start += w
-        if name == "inputs":
-            continue
-        total = np.sqrt((draw_sd**2).mean(0) + draw_mean.var(0))
-        out[name] = LayerTrajectory(name, time, draw_mean.mean(0), total, draw_mean, draw_sd)
-    return out
+    return found
 
 
 @dataclass(frozen=True)
@@ -116,17 +74,17 @@ class StaticBand:
 
 def static_function(fit: Fit, name: str, record: Record, channel: int, points: int) -> StaticBand:
     """See `Fit.static_function`."""
-    wires = {one.name: one for one in cascade_of(fit).wires}
+    wires = {wire.name: wire for wire in fit.model.wires}
     layer = fit.system.layer(name)
     if isinstance(layer, DynamicSystem):
         raise invalid("name", expected="a static layer", got=f"{name!r}, a dynamic one")
-    one = wires[name]
-    if not 0 <= channel < one.channels:
-        raise invalid("channel", expected=f"0 to {one.channels - 1}", got=repr(channel))
+    wire = wires[name]
+    if not 0 <= channel < wire.channels:
+        raise invalid("channel", expected=f"0 to {wire.channels - 1}", got=repr(channel))
     record = one_record(fit, record)
     found = {k: v.mean for k, v in layers(fit, record).items()}
     found["inputs"] = fit.system.driving(scaled_inputs(fit.scaling, record)).numpy()
-    seen = np.concatenate([found[source] for source in one.sources], -1)
+    seen = np.concatenate([found[source] for source in wire.sources], -1)
     low, high = seen[:, channel].min(), seen[:, channel].max()
     margin = 0.1 * (high - low)
     x = np.linspace(low - margin, high + margin, points)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import fields
 
 from pyro_dynogp.data.channels import Channel
-from pyro_dynogp.models.variants import Model, as_cascade
+from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.wiring import Dynamic
 
 # In a tie, what products of inputs at two times, or responses that change with time, speak for.
@@ -50,13 +50,12 @@ def experiment(first: str, others: tuple[str, ...]) -> str:
 
 def describe(model: Model) -> tuple[str, ...]:
     """A line for each part of a model, inputs first, measured output last."""
-    cascade = as_cascade(model)
     driving = [one for one in model.channels if not one.direct]
     direct = [one for one in model.channels if one.direct]
     count = model.inputs - model.direct
     lines = [f"{count} input{'s' if count != 1 else ''}"]
     lines += [in_words(one) for one in driving]
-    for layer in cascade.layers:
+    for layer in model.layers:
         if isinstance(layer, Dynamic):
             noise = "process noise" if layer.process_noise else "no process noise"
             plural = "s" if layer.pairs != 1 else ""
@@ -69,7 +68,7 @@ def describe(model: Model) -> tuple[str, ...]:
     plain = model.direct - sum(len(one.names) for one in direct)
     if plain:
         lines.append(f"plus {plain} direct inputs")
-    likelihood = cascade.likelihood
+    likelihood = model.likelihood
     noise = "Gaussian noise"
     if likelihood.varying:
         noise = f"Gaussian noise that varies with the {likelihood.of}"

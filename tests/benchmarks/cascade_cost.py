@@ -17,7 +17,7 @@ from pyro.optim import ClippedAdam
 import pyro_dynogp as dgp
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.methods.trajectories import layer_guide, with_trajectories
-from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.models.architectures import Cascade
 
 # Seconds of one epoch of the authors' code on two cores of such a machine: mini-batch times by
 # number of mini-batches (10 samples; coupled drives 40), as measured beforehand.

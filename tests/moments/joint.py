@@ -8,7 +8,7 @@ import torch
 from pyro_dynogp.layers.functions import StaticFunction
 from pyro_dynogp.layers.kernels import SampledKernel, _default_form
 from pyro_dynogp.layers.noise import Gaussian, Noise
-from pyro_dynogp.models.system import CascadeSystem, DynamicSystem, StaticSystem
+from pyro_dynogp.models.system import System, DynamicSystem, StaticSystem
 from pyro_dynogp.models.wiring import Dynamic, wire
 from tests.lti import oracles
 from tests.lti.oracles import tensor
@@ -121,7 +121,7 @@ def linear_cascade(inputs, layers, time, u, *, seed=0, noise="shared", known_sta
     n_y = layers[-1].outputs
     sd = rng.uniform(0.2, 0.6, n_y)
     offset = 0.5 * rng.standard_normal(n_y) if isinstance(layers[-1], Dynamic) else None
-    system = CascadeSystem(
+    system = System(
         wires,
         tuple(systems),
         Noise(Gaussian(), tensor(sd), None),

@@ -11,7 +11,7 @@ from pyro_dynogp.layers.functions import StaticFunction
 from pyro_dynogp.layers.kernels import SampledKernel, _default_form
 from pyro_dynogp.layers.noise import Gaussian, Noise
 from pyro_dynogp.models.outputs import ObservedCascade
-from pyro_dynogp.models.system import CascadeSystem, DynamicSystem, StaticSystem
+from pyro_dynogp.models.system import System, DynamicSystem, StaticSystem
 from pyro_dynogp.models.wiring import Dynamic, Static, wire
 from tests.lti import oracles as lti
 from tests.lti.oracles import tensor
@@ -93,7 +93,7 @@ def test_wiener_hammerstein_by_particles(seed):
         DynamicSystem(second.modes, nothing, zero),
     )
     noise = Noise(Gaussian(), torch.tensor([sd], dtype=torch.float64), None)
-    system = CascadeSystem(wires, layers, noise, torch.tensor([0.4], dtype=torch.float64))
+    system = System(wires, layers, noise, torch.tensor([0.4], dtype=torch.float64))
     one = torch.ones(1, dtype=torch.float64)
     observed = ObservedCascade(system, time, tensor(u), one, 0.0 * one)
     value = float(observed.log_prob(tensor(y)))

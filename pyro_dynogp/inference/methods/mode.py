@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 from pyro_dynogp.data.record import Record
@@ -18,8 +17,9 @@ from pyro_dynogp.inference.starts.plans import (
 )
 from pyro_dynogp.inference.starts.poles import grown, starting_values
 from pyro_dynogp.layers.noise import TYPICAL
-from pyro_dynogp.models.model import Cascade
-from pyro_dynogp.models.wiring import Dynamic, Static
+from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.variants import without_noise_below_functions
+from pyro_dynogp.models.wiring import Dynamic
 from pyro_dynogp.support.checkpoints import NOTHING_KEPT, Checkpoints
 from pyro_dynogp.support.parallel import seeded
 
@@ -33,7 +33,7 @@ UNEXPLAINED = 0.5
 
 
 def starting_points(
-    model: Cascade,
+    model: Model,
     records: Sequence[Record],
     count: int,
     steps: int,
@@ -72,28 +72,6 @@ def starting_points(
         ]
 
 
-def deterministic(model: Cascade) -> Cascade:
-    """The model without process noise, but in layers that nothing else drives."""
-    layers = tuple(
-        replace(layer, process_noise=False, name=one.name)
-        if isinstance(layer, Dynamic) and layer.process_noise and one.channels
-        else layer
-        for one, layer in zip(model.wires, model.layers, strict=True)
-    )
-    return replace(model, layers=layers)
-
-
-def without_process_noise(model: Cascade) -> Cascade:
-    """The model with deterministic dynamics; the same one where no static layer sees noise.
-
-    Layers that nothing else drives keep their process noise.
-    """
-    static = [place for place, one in enumerate(model.layers) if isinstance(one, Static)]
-    last = static[-1] if static else 0
-    seen = any(isinstance(one, Dynamic) and one.process_noise for one in model.layers[:last])
-    return deterministic(model) if seen else model
-
-
 def _louder(values: Values) -> Values:
     """A start whose measurement noise can stand for what dynamics and functions lack as yet.
 
@@ -112,7 +90,7 @@ def _one_output(records: Sequence[Record]) -> tuple[Record, ...]:
 
 
 def best_optima(
-    model: Cascade,
+    model: Model,
     records: Sequence[Record],
     restarts: int,
     steps: int,
@@ -140,7 +118,7 @@ def best_optima(
 
 
 def climb(
-    model: Cascade,
+    model: Model,
     records: Record | Sequence[Record],
     starts: Sequence[Values],
     learnt: Sequence[Values],
@@ -157,7 +135,7 @@ def climb(
     forecasts.
     """
     options |= {"checkpoints": checkpoints, "kept": 0.5}
-    quiet = without_process_noise(model)
+    quiet = without_noise_below_functions(model)
     if quiet != model and starts:
         steps = max(1, steps // 2)
         key = "without-process-noise"
@@ -169,7 +147,7 @@ def climb(
 
 
 def grow(
-    model: Cascade, record: Record, learnt: Values, start: Values, *, steps: int, seed: int
+    model: Model, record: Record, learnt: Values, start: Values, *, steps: int, seed: int
 ) -> list[Optimum]:
     """Optima of the collapsed model near what a smaller model, or the same one, has learnt.
 
@@ -180,7 +158,7 @@ def grow(
         "steps": steps, "seed": seed, "workers": 1, "optimizer": "preconditioned",
     }  # fmt: skip
     starts = [learnt]
-    quiet = without_process_noise(model)
+    quiet = without_noise_below_functions(model)
     if quiet != model:
         (found, *_) = maximise(quiet, record, [_louder(learnt)], key="grown-quiet", **options)
         starts.append(grown(found.values, start))

@@ -28,12 +28,9 @@ from pyro_dynogp.inference.fitted import Fit
 from pyro_dynogp.inference.methods.mode import GuideChoice, starting_points
 from pyro_dynogp.inference.methods.svi import Trained, train
 from pyro_dynogp.layers.noise import Gaussian
-from pyro_dynogp.lti.grid import time_grid
-from pyro_dynogp.models.assembly import assemble
-from pyro_dynogp.models.model import Cascade
-from pyro_dynogp.models.system import scaled_inputs, scaled_outputs
+from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.wiring import Dynamic
-from pyro_dynogp.prediction.layers import smoothed_layers
 from pyro_dynogp.support.checkpoints import Checkpoints, Piece
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.parallel import child_seeds, parallel_map, seeded
@@ -45,13 +42,13 @@ INDUCING_SHARE, INDUCING_MOST = 0.5, 400
 PSEUDO_SD = 0.3
 
 
-def with_trajectories(model: Cascade) -> Cascade:
+def with_trajectories(model: Model) -> Model:
     """The model that a guide of layers fits: a linear Gaussian last layer is integrated exactly."""
     exact = isinstance(model.layers[-1], Dynamic) and model.likelihood == Gaussian()
     return replace(model, integrate="last" if exact else "none")
 
 
-def layer_guide(model: Cascade, choice: Any, values: Mapping[str, Tensor], n: int) -> LayerGuide:
+def layer_guide(model: Model, choice: Any, values: Mapping[str, Tensor], n: int) -> LayerGuide:
     """Guide for a cascade with its trajectories as sites.
 
     Trajectories: Gauss-Markov sites or inducing times; whitened inducing values: a multivariate
@@ -94,7 +91,7 @@ def layer_guide(model: Cascade, choice: Any, values: Mapping[str, Tensor], n: in
 
 @dataclass(frozen=True)
 class _Task:
-    model: Cascade
+    model: Model
     records: Record | tuple[Record, ...]
     guide: Any
     values: Values
@@ -196,33 +193,27 @@ def _draw(
     return stack([own for own, _ in traces]), log_q
 
 
-def starting_trajectories(model: Cascade, records: Sequence[Record], values: Values) -> Values:
+def starting_trajectories(model: Model, records: Sequence[Record], values: Values) -> Values:
     """First trajectories of the dynamic layers: smoothed by the moment-matching filter."""
     assert model.scaling is not None
     out: Values = {}
     for index, record in enumerate(records):
         suffix = "" if len(records) == 1 else f"_{index}"
-        with torch.no_grad(), pyro.poutine.block():
-            sample = pyro.poutine.condition(model.collapsed.sample_system, data=dict(values))
-            system = sample(model.scaling)
-            states = {
-                one.name: values[f"{one.name}_initial_state{suffix}"] for one in model.state_sites
-            }
-            system = model.begin(system, states)
-            inputs = scaled_inputs(model.scaling, record)
-            assembly = assemble(system, time_grid(record.time), inputs)
-            y = scaled_outputs(model.scaling, record)
-            found = smoothed_layers(assembly, assembly.with_outputs(y), record.time)
+        with torch.no_grad():
+            system = model.collapsed.system(values, model.scaling)
+            system = model.begin(system, model.states_of(values, suffix))
+            outputs = output_process(system, model.scaling, record)
+            found = outputs.smooth(record.tensors().observations)
         for one in model.wires:
             integrated = one.last and model.integrate == "last"
             if isinstance(one.layer, Dynamic) and not integrated:
-                path = torch.tensor(found[one.name].mean)
+                path = torch.tensor(found[one.name].mean[0])
                 out[one.name + suffix] = path if one.layer.outputs > 1 else path[:, 0]
     return out
 
 
 def fit_layered(
-    model: Cascade,
+    model: Model,
     records: Sequence[Record],
     guide: GuideChoice,
     *,
@@ -313,11 +304,7 @@ def fit_layered(
     )
 
 
-def _parameter_sites(model: Cascade, records: Sequence[Record]) -> list[str]:
+def _parameter_sites(model: Model, records: Sequence[Record]) -> list[str]:
     """Names of the sites that the collapsed model has."""
-    with seeded(0), torch.no_grad(), pyro.poutine.block():
-        blind = [record[:2] for record in records]
-        trace = pyro.poutine.trace(model.collapsed).get_trace(
-            blind[0] if len(blind) == 1 else tuple(blind)
-        )
-    return [n for n, s in trace.nodes.items() if s["type"] == "sample" and not s["is_observed"]]
+    assert model.scaling is not None
+    return [site.name for site in model.collapsed.all_sites(model.scaling, len(records))]

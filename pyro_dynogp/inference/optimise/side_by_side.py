@@ -18,8 +18,7 @@ from pyro_dynogp.data.record import Record, as_records
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.optimise.lockstep import Functions, in_lockstep
-from pyro_dynogp.models.linear import LinearDynamicGP
-from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.models.model import Model
 from pyro_dynogp.support.tensors import as_tensor
 
 Result = TypeVar("Result")
@@ -131,8 +130,8 @@ def _alike(a: Potential, b: Potential) -> bool:
     )
 
 
-def _is_scaled(model: Any) -> TypeGuard[LinearDynamicGP | Cascade]:
-    return isinstance(model, LinearDynamicGP | Cascade) and model.scaling is not None
+def _is_scaled(model: Any) -> TypeGuard[Model]:
+    return isinstance(model, Model) and model.scaling is not None
 
 
 def _records(potential: Potential) -> tuple[Record, ...]:

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-import pyro
 import torch
 from torch import Tensor
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.starts.poles import random_poles
-from pyro_dynogp.lti.response import mean_response
-from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.priors import TimeScale
 from pyro_dynogp.models.wiring import Dynamic, Wire
 
@@ -32,7 +30,7 @@ class DynamicStart:
 
     def __init__(
         self,
-        model: Cascade,
+        model: Model,
         one: Wire,
         layer: Dynamic,
         scaling: Scaling,
@@ -111,11 +109,10 @@ class DynamicStart:
 
     def response(self, values: Values, record: Record, x: Tensor) -> Tensor:
         """Mean trajectory (n, w) of the layer."""
-        with torch.no_grad(), pyro.poutine.block():
-            sample = pyro.poutine.condition(self.model.sample_dynamic_layer, data=values)
-            modes = sample(self.one, self.layer, TimeScale.of(self.scaling)).modes
-            out = mean_response(modes, record.time, x if modes.inputs else None).output
-        return out if modes.several_outputs else out.unsqueeze(-1)
+        with torch.no_grad():
+            time_scale = TimeScale.of(self.scaling)
+            layer = self.model.dynamic_system(self.one, self.layer, values, time_scale)
+            return layer.mean(x, record.time)
 
     def scale(self, values: Values, factor: float) -> None:
         """Multiply the layer's output."""

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import pyro
 import torch
 from torch import Tensor
 
@@ -17,16 +15,16 @@ from pyro_dynogp.inference.starts.dynamic import DynamicStart, Values
 from pyro_dynogp.inference.starts.static import start_static
 from pyro_dynogp.layers.noise import TYPICAL
 from pyro_dynogp.lti.grid import time_grid
+from pyro_dynogp.models.architectures import LinearDynamicGP
 from pyro_dynogp.models.assembly import assemble
-from pyro_dynogp.models.linear import LinearDynamicGP
-from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.system import DynamicSystem, scaled_inputs, scaled_outputs, see
 from pyro_dynogp.models.wiring import INPUTS, Dynamic, Static, Wire
 from pyro_dynogp.moments import filtering, smoothing
 from pyro_dynogp.support.parallel import child_seeds
 
 
-def linear_twin(model: Cascade, layer: Dynamic, scaling: Scaling) -> LinearDynamicGP:
+def linear_twin(model: Model, layer: Dynamic, scaling: Scaling) -> Model:
     """The linear model whose optimum starts a dynamic layer."""
     return LinearDynamicGP(
         inputs=model.inputs,
@@ -41,7 +39,7 @@ def linear_twin(model: Cascade, layer: Dynamic, scaling: Scaling) -> LinearDynam
     )
 
 
-def leading_layers(model: Cascade) -> tuple[Wire, ...]:
+def leading_layers(model: Model) -> tuple[Wire, ...]:
     """Dynamic layers that can take over a linear fit: they see as many channels as inputs."""
     return tuple(
         one
@@ -69,7 +67,7 @@ class Plan:
 
 
 def plans(
-    model: Cascade, optima: Mapping[str, Sequence[Mapping[str, Tensor]]], count: int, seed: int
+    model: Model, optima: Mapping[str, Sequence[Mapping[str, Tensor]]], count: int, seed: int
 ) -> list[Plan]:
     """Restarts in turn over leading layers and optima of the linear fit.
 
@@ -99,9 +97,7 @@ def plans(
     return out
 
 
-def starting_point(
-    model: Cascade, records: Sequence[Record], scaling: Scaling, plan: Plan
-) -> Values:
+def starting_point(model: Model, records: Sequence[Record], scaling: Scaling, plan: Plan) -> Values:
     """Values of every site of a cascade, layer by layer along the mean trajectories.
 
     The leading layer is the linear fit, other dynamic layers pass their input on with small random
@@ -166,11 +162,13 @@ def starting_point(
         values["log_noise_constant"] = (noise / TYPICAL).log()
     else:
         values["noise_sd"] = noise
-    _complete(model, scaling, values)
+    for site in model.all_sites(scaling, len(records)):  # hyperparameters of other kernels
+        if site.name not in values:
+            values[site.name] = site.typical()
     return {name: value.detach().clone() for name, value in values.items()}
 
 
-def _direct(model: Cascade, plan: Plan) -> Tensor:
+def _direct(model: Model, plan: Plan) -> Tensor:
     """Weights of direct inputs as the linear fit has them, where it has all outputs."""
     shape = (model.outputs, model.direct)
     found = None if plan.linear is None else plan.linear.get("direct")
@@ -178,7 +176,7 @@ def _direct(model: Cascade, plan: Plan) -> Tensor:
 
 
 def _linear_state(
-    model: Cascade,
+    model: Model,
     one: Wire,
     scaling: Scaling,
     record: Record,
@@ -189,11 +187,13 @@ def _linear_state(
     assert isinstance(layer, Dynamic)
     if layer.outputs != model.outputs:
         return torch.zeros(2 * layer.pairs, dtype=torch.float64)
-    twin = Cascade(
+    twin = Model(
         model.inputs, (layer,), direct=model.direct, initial_state="integrated", scaling=scaling
     )
-    with torch.no_grad(), pyro.poutine.block():
-        system = pyro.poutine.condition(twin.sample_system, data=dict(linear))(scaling)
+    with torch.no_grad():
+        ((place, _),) = twin.dynamic
+        named = {place.name + k[1:] if k[:2] == "g_" else k: v for k, v in linear.items()}
+        system = twin.system(named, scaling)
         assembly = assemble(system, time_grid(record.time), scaled_inputs(scaling, record))
         problem = assembly.with_outputs(scaled_outputs(scaling, record))
         elements, _ = problem.elements()
@@ -211,25 +211,3 @@ def _linear_state(
         root = torch.linalg.cholesky(past + 1e-9 * past.diagonal().mean() * eye)
         state = torch.linalg.solve_triangular(root, left.unsqueeze(-1), upper=False).squeeze(-1)
     return state.clamp(-3.0, 3.0)
-
-
-def _middle(name: str, node: Mapping[str, Any]) -> Tensor:
-    """A typical value of a site: zero for standard normal ones, the mean of normal ones."""
-    fn = node["fn"]
-    base = fn.base_dist if hasattr(fn, "base_dist") else fn
-    if isinstance(base, torch.distributions.LogNormal):
-        return base.loc.exp().expand(node["value"].shape).clone()
-    if isinstance(base, torch.distributions.Normal):
-        return base.mean.expand(node["value"].shape).clone()
-    return node["value"].detach().clone()
-
-
-def _complete(model: Cascade, scaling: Scaling, values: Values) -> None:
-    """Typical values for sites that no layer's start knows (hyperparameters of other kernels)."""
-    with pyro.poutine.block(), torch.no_grad():
-        trace = pyro.poutine.trace(
-            pyro.poutine.condition(model.sample_system, data=values)
-        ).get_trace(scaling)
-    for name, node in trace.nodes.items():
-        if node["type"] == "sample" and name not in values and not node["is_observed"]:
-            values[name] = _middle(name, node)

@@ -12,20 +12,17 @@ from torch import Tensor
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.scaling import Scaling
+from pyro_dynogp.layers.noise import TYPICAL
+from pyro_dynogp.layers.sites import Site
 from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import held_states
-from pyro_dynogp.models.linear import LinearDynamicGP
+from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.priors import HORSESHOE_SCALE, TimeScale, numerators
-
-# What is left of new rows of a site, by the end of its name, where they shall do nothing yet. Not
-# nothing of process noise: of a gain that is zero the density has no slope.
-SILENT = {"input_gain": 0.0, "feedthrough": 0.0, "direct": 0.0, "initial_state": 0.0,
-          "noise_gain_unit": 0.05}  # fmt: skip
 
 
 def starting_values(
-    model: LinearDynamicGP, records: Sequence[Record], *, count: int, seed: int, tries: int = 48
+    model: Model, records: Sequence[Record], *, count: int, seed: int, tries: int = 48
 ) -> list[dict[str, Tensor]]:
     """Values of every site for the `count` best of `tries` random sets of poles.
 
@@ -38,32 +35,36 @@ def starting_values(
         tries: sets of poles to look at; fewer for very long records.
     """
     scaling = model.scaling or Scaling.from_records(records)
+    ((_, layer),) = model.dynamic
     generator = np.random.default_rng(seed)
     total = sum(len(record) for record in records)
     tries = max(count, min(tries, int(2e6 / total)))
     candidates = []
     for _ in range(tries):
-        poles = random_poles(model.pairs, scaling, generator)
+        poles = random_poles(layer.pairs, scaling, generator)
         candidates.append(values_given_poles(model, records, scaling, poles))
     candidates.sort(key=lambda candidate: candidate[0])
     return [values for _, values in candidates[:count]]
 
 
 def grown(
-    values: Mapping[str, Tensor], start: Mapping[str, Tensor], *, silent: bool = False
+    values: Mapping[str, Tensor],
+    start: Mapping[str, Tensor],
+    sites: Sequence[Site] = (),
 ) -> dict[str, Tensor]:
     """A start with what another fit has learnt: values of a smaller model, or of the same one.
 
     Sites of one name and as many dimensions share their first rows and columns; the rest of the
-    start (new inputs, pairs, layers) stays as it is. With `silent` the rest of a shared site does
-    nothing yet, so that the start explains nearly as much as what it has grown from.
+    start (new inputs, pairs, layers) stays as it is. Of given `sites` the rest of one that is
+    shared does nothing yet (`Site.growth`), so that the start explains nearly as much as what it
+    has grown from.
     """
+    growth = {site.name: site.growth for site in sites}
     out = {}
     for name, value in start.items():
         new = value.clone()
         if name in values and values[name].dim() == new.dim():
-            if silent:
-                new *= next((x for end, x in SILENT.items() if name.endswith(end)), 1.0)
+            new *= growth.get(name, 1.0)
             common = tuple(
                 slice(min(a, b)) for a, b in zip(new.shape, values[name].shape, strict=True)
             )
@@ -82,14 +83,16 @@ def random_poles(pairs: int, scaling: Scaling, generator: np.random.Generator) -
 
 
 def values_given_poles(
-    model: LinearDynamicGP, records: Sequence[Record], scaling: Scaling, poles: np.ndarray
+    model: Model, records: Sequence[Record], scaling: Scaling, poles: np.ndarray
 ) -> tuple[float, dict[str, Tensor]]:
     """Mean squared residual, and values of every site, for poles (P,) [1/time unit]."""
-    P, n_u, n_y = model.pairs, model.inputs - model.direct, model.outputs
+    ((wire, layer),) = model.dynamic
+    g = wire.name
+    P, n_u, n_y = layer.pairs, model.inputs - model.direct, model.outputs
     designs, targets = [], []
     for record in records:
         u = (record.inputs - scaling.input_offset) / scaling.input_scale
-        dynamic = _design(poles, record.time, u[:, :n_u], model.feedthrough)
+        dynamic = _design(poles, record.time, u[:, :n_u], layer.feedthrough)
         designs.append(np.concatenate([u[:, n_u:], dynamic], axis=1))
         targets.append((record.outputs - scaling.output_offset) / scaling.output_scale)
     X, Y = np.concatenate(designs), np.concatenate(targets)
@@ -102,11 +105,15 @@ def values_given_poles(
     residues = (gains[..., 0] + 1j * gains[..., 1]) * rate[:, None]  # c_aj B_jm
     unit_rate = TimeScale.of(scaling).typical_rate
     values: dict[str, Any] = {
-        "g_log_decay": np.log(-poles.real / unit_rate),
-        "g_log_frequency": np.log(poles.imag / unit_rate),
+        f"{g}_log_decay": np.log(-poles.real / unit_rate),
+        f"{g}_log_frequency": np.log(poles.imag / unit_rate),
         "offset": weights[:, -1],
-        "noise_sd": 0.7 * spread + 1e-3,
     }
+    noise = 0.7 * spread + 1e-3
+    if model.likelihood.varying:
+        values["log_noise_constant"] = np.log(noise / TYPICAL)
+    else:
+        values["noise_sd"] = noise
     if model.direct:
         values["direct"] = direct
     direction = np.ones((n_y, P), dtype=complex)
@@ -119,26 +126,25 @@ def values_given_poles(
                 left, size, right = np.linalg.svd(residues[:, j, :], full_matrices=False)
                 turn = np.exp(-1j * np.angle(left[0, 0]))
                 direction[:, j], B[j] = left[:, 0] * turn, size[0] * right[0] / turn
-        values["g_output_gain"] = np.stack([direction.real, direction.imag], -1)
+        values[f"{g}_output_gain"] = np.stack([direction.real, direction.imag], -1)
     if n_u:
         # From residues to sections: b1 = g1 |lambda|, b0 = g0 |lambda|^2.
         section = numerators(torch.as_tensor(poles), torch.as_tensor(B)).numpy()
         section = section / np.stack([rate, rate**2], -1)[:, None, :]
-        values["g_input_gain"] = np.clip(section, -10.0, 10.0)
-        if model.feedthrough:
+        values[f"{g}_input_gain"] = np.clip(section, -10.0, 10.0)
+        if layer.feedthrough:
             D = weights[:, 2 * P * n_u : -1]
-            values["g_feedthrough"] = D if model.several_outputs else D[0]
-    if model.process_noise:
-        brownian = model.brownian or n_y
+            values[f"{g}_feedthrough"] = D if model.several_outputs else D[0]
+    if layer.process_noise:
+        brownian = layer.brownian or n_y
         share = 0.3 * float(spread.mean()) / math.sqrt(P * brownian)
-        values["g_noise_gain_local_scale"] = np.full(P, math.sqrt(share / HORSESHOE_SCALE))
+        values[f"{g}_noise_gain_local_scale"] = np.full(P, math.sqrt(share / HORSESHOE_SCALE))
         unit = np.full((P, brownian, 2), math.sqrt(0.5 * share / HORSESHOE_SCALE))
-        values["g_noise_gain_unit"] = unit
-    if model.initial_state == "site":
-        suffixes = [""] if len(records) == 1 else [f"_{i}" for i in range(len(records))]
-        for suffix in suffixes:
-            values[f"initial_state{suffix}"] = np.zeros(2 * P)
+        values[f"{g}_noise_gain_unit"] = unit
     tensors = {name: torch.tensor(value, dtype=torch.float64) for name, value in values.items()}
+    for site in model.all_sites(scaling, len(records)):
+        if site.name not in tensors:
+            tensors[site.name] = site.typical()
     return float(np.nanmean(residual**2)), tensors
 
 

@@ -9,12 +9,12 @@ from torch import Tensor
 
 from pyro_dynogp.inference.starts.dynamic import Values
 from pyro_dynogp.layers.functions import StaticFunction
-from pyro_dynogp.models.model import Cascade
+from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.wiring import Static, Wire
 
 
 def start_static(
-    model: Cascade,
+    model: Model,
     one: Wire,
     layer: Static,
     values: Values,
@@ -72,9 +72,9 @@ def start_static(
         return [function.mean(s) for s in seen]
 
 
-def _function(model: Cascade, one: Wire, layer: Static, values: Values) -> StaticFunction:
+def _function(model: Model, one: Wire, layer: Static, values: Values) -> StaticFunction:
     with torch.no_grad():
-        return model.static_given(one, layer, values)
+        return model.static_function(one, layer, values)
 
 
 def _whiten(function: StaticFunction, u: Tensor) -> Tensor:

@@ -1,0 +1,156 @@
+"""Approximate engine: outputs of any cascade by the moment-matching filter over its joint state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pyro_dynogp.distributions.pointwise import Moments
+from pyro_dynogp.lti.grid import time_grid
+from pyro_dynogp.models.assembly import Assembly, assemble
+from pyro_dynogp.models.draws import JointState
+from pyro_dynogp.models.output_process import LayerMoments, OutputProcess
+from pyro_dynogp.models.system import System
+from pyro_dynogp.moments import filtering, smoothing
+from pyro_dynogp.moments.layout import Layout, Values
+from pyro_dynogp.moments.problem import FilterProblem, each, log_density
+from pyro_dynogp.support.tensors import as_tensor, broadcast
+
+# Results (3, n, n_y) of a compiled pass: mean (or error), variance, log-density.
+Pass = Callable[[Layout, Values], tuple[np.ndarray, np.ndarray, np.ndarray]]
+
+
+class MomentOutputs(OutputProcess):
+    """Measured outputs by moment matching; see `OutputProcess`.
+
+    The log-density is that of a Gaussian assumed-density filter over the joint state of all dynamic
+    layers: exact where the static layers are linear and the noise is Gaussian, else as good as
+    Gaussian moments are: joint ones of a static layer's input and output inside the cascade; where
+    the last layer is a function of one signal, those of the state given each sample.
+    """
+
+    @cached_property
+    def assembly(self) -> Assembly:
+        """The system along the record, written as a problem for the filter."""
+        return self._assembled(self.system, self.grid.time, self.scaled_inputs)
+
+    def _assembled(self, system: System, time: Tensor, inputs: Tensor) -> Assembly:
+        noise_sd = self.noise_sd if len(time) == len(self.grid) else None
+        if self.start is None:
+            return assemble(system, time_grid(time), inputs, noise_sd)
+        known = assemble(self.start.first_of(system), time_grid(time), inputs, noise_sd)
+        return replace(known, problem=replace(known.problem, P0=self.start.covariance))
+
+    def _problem(self, y: Tensor | None) -> FilterProblem:
+        if y is None:
+            return self.assembly.problem
+        return self.assembly.with_outputs(self.scaled(y))
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-density (*s, *batch) of outputs (*s, *batch, *event) [nats]."""
+        total = log_density(self._problem(value))
+        there = (~torch.isnan(self.columns(value))).to(torch.float64)
+        jacobian = (there * self.scale.log()).sum((-2, -1))
+        lead = value.shape[: value.dim() - len(self.event_shape)]
+        return (total - jacobian).expand(broadcast(lead, self.batch_shape))
+
+    def _pass(self, y: Tensor, compiled: Pass) -> tuple[Tensor, Tensor, Tensor]:
+        """Results (*b, n, n_y) of a pass for each element of the batch, scaled."""
+        problem = self._problem(y)
+        elements, batch = problem.elements()
+        found = each(lambda b: np.stack(compiled(problem.layout, elements[b])), len(elements))
+        stacked = torch.from_numpy(np.stack(found))
+        shaped = stacked.reshape(*batch, *stacked.shape[1:])
+        return shaped[..., 0, :, :], shaped[..., 1, :, :], shaped[..., 2, :, :]
+
+    def _moments(self, mean: Tensor, variance: Tensor, density: Tensor) -> Moments:
+        return Moments(
+            self.shift + self.scale * mean,
+            self.scale.square() * variance,
+            density - self.scale.log(),
+        )
+
+    def one_step(self, y: Tensor) -> Moments:
+        """See `OutputProcess`."""
+        error, variance, density = self._pass(y, smoothing.innovate)
+        return self._moments(self.scaled(y) - error, variance, density)
+
+    def ahead(self, y: Tensor, horizon: int) -> Moments:
+        """See `OutputProcess`."""
+        return self._moments(
+            *self._pass(y, lambda layout, v: smoothing.predict_ahead(layout, v, horizon))
+        )
+
+    def left_out(self, y: Tensor) -> Moments:
+        """See `OutputProcess`."""
+
+        def compiled(layout: Layout, v: Values) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            _, means, covariances, _, _ = filtering.run(layout, v)
+            mean, variance, density = smoothing.leave_one_out(layout, v, means, covariances)
+            return mean, variance, density
+
+        return self._moments(*self._pass(y, compiled))
+
+    def prediction_errors(self, y: Tensor, horizon: int, count: int) -> None:
+        """None: errors are drawn independently of each other."""
+
+    def state_after(self, y: Tensor, gap: float, next_inputs: Tensor) -> JointState:
+        """See `OutputProcess`; one grid over the past and that time: the filter carries on."""
+        time = torch.cat([self.grid.time, self.grid.time[-1:] + gap])
+        following = next_inputs
+        if following.shape[-1]:
+            centred = following - as_tensor(self.scaling.input_offset)
+            following = centred / as_tensor(self.scaling.input_scale)
+        inputs = torch.cat([self.scaled_inputs, following.unsqueeze(-2)], -2)
+        assembly = self._assembled(self.system, time, inputs)
+        z = self.scaled(y)
+        z = torch.cat([z, torch.full_like(z[..., :1, :], torch.nan)], -2)
+        problem = assembly.with_outputs(z)
+        elements, batch = problem.elements()
+        N = problem.m0.shape[-1]
+        ends = each(lambda b: filtering.run(problem.layout, elements[b]), len(elements))
+        m = torch.from_numpy(np.stack([end[3][:N] for end in ends])).reshape(*batch, N)
+        P = torch.from_numpy(np.stack([end[4][:N, :N] for end in ends])).reshape(*batch, N, N)
+        return JointState(assembly.known_state + m, P)
+
+    def smooth(self, y: Tensor | None) -> dict[str, LayerMoments]:
+        """See `OutputProcess`."""
+        problem = self._problem(y)
+        elements, batch = problem.elements()
+        A = problem.G.shape[-1]
+        random = {k: s for k, s in self.assembly.signals.items() if s.rows is not None}
+        rows = [
+            s.rows.expand(*batch, *s.rows.shape[-2:]).reshape(-1, s.rows.shape[-2], A)
+            for s in random.values()
+            if s.rows is not None
+        ]
+        nothing = torch.zeros(len(elements), 0, A, dtype=torch.float64)
+        joined = (torch.cat(rows, -2) if rows else nothing).contiguous().numpy()
+
+        def compiled(b: int) -> tuple[np.ndarray, np.ndarray]:
+            _, means, covariances, _, _ = filtering.run(problem.layout, elements[b])
+            mean, variance = smoothing.smooth(
+                problem.layout, elements[b], joined[b], means, covariances
+            )
+            return mean @ joined[b].T, variance
+
+        found = each(compiled, len(elements))
+        mean = np.stack([m for m, _ in found])
+        sd = np.sqrt(np.stack([v for _, v in found]))
+        out, start = {}, 0
+        for wire in self.system.wires:
+            signal = self.assembly.signals[wire.name]
+            n, w = signal.known.shape[-2:]
+            known = signal.known.expand(*batch, n, w).reshape(-1, n, w).numpy()
+            if signal.rows is None:
+                out[wire.name] = LayerMoments(known, np.zeros_like(known))
+                continue
+            own = slice(start, start + w)
+            out[wire.name] = LayerMoments(known + mean[..., own], sd[..., own])
+            start += w
+        return out
