@@ -37,18 +37,19 @@ class JointState:
     def of_layers(cls, means: Sequence[Tensor], covariances: Sequence[Tensor]) -> JointState:
         """From complex means (*b, P) and real covariances (*b, 2P, 2P) of the layers' states."""
         half = sum(mean.shape[-1] for mean in means)
-        batch = broadcast(*(mean.shape[:-1] for mean in means))
+        shapes = [mean.shape[:-1] for mean in means]
+        batch = broadcast(*shapes, *(covariance.shape[:-2] for covariance in covariances))
         mean = torch.zeros((*batch, 2 * half), dtype=torch.float64)
-        covariance = torch.zeros((*batch, 2 * half, 2 * half), dtype=torch.float64)
+        joint = torch.zeros((*batch, 2 * half, 2 * half), dtype=torch.float64)
         before = 0
         for part, own in zip(means, covariances, strict=True):
             P = part.shape[-1]
             index = torch.cat([torch.arange(P), torch.arange(P) + half]) + before
             real = torch.cat([part.real, part.imag], -1)
             mean[..., index] = real.expand((*batch, 2 * P))
-            covariance[..., index[:, None], index] = own.expand((*batch, 2 * P, 2 * P))
+            joint[..., index[:, None], index] = own.expand((*batch, 2 * P, 2 * P))
             before += P
-        return cls(mean, covariance)
+        return cls(mean, joint)
 
     def modal(self) -> ModalState:
         """The state of a single layer."""

@@ -212,7 +212,9 @@ class ExactOutputs(OutputProcess):
         z = z.expand(observed.batch_shape + observed.event_shape)
         return ConditionedLTIProcess(observed, z)
 
-    def state_after(self, y: Tensor, gap: float, next_inputs: Tensor) -> JointState:
+    def state_after(
+        self, y: Tensor, gap: float, next_inputs: Tensor, *, process_noise: bool = True
+    ) -> JointState:
         """See `OutputProcess`."""
         means, covariances = [], []
         for wire, layer in self.system.dynamic:
@@ -226,6 +228,7 @@ class ExactOutputs(OutputProcess):
                 response = layer.response(see(self._signals, wire), self.grid)
                 nothing = torch.zeros(J, J, dtype=torch.float64)
                 end, modes = ModalState(response.state, nothing), layer.modes
+            modes = modes if process_noise else modes.without_process_noise()
             end = propagate(modes, end, gap, held if modes.inputs else None)
             assert end.covariance is not None
             means.append(end.mean.expand((*self.batch_shape, layer.modes.pairs)))

@@ -111,13 +111,14 @@ class Model:
             ("initial_state", get_args(InitialState)),
         ):
             if getattr(self, name) not in choices:
-                expected = f"one of {list(choices)}"
+                *most, last = (repr(choice) for choice in choices)
+                expected = f"{', '.join(most)} or {last}"
                 raise invalid(name, expected=expected, got=repr(getattr(self, name)))
         check_direct(self.inputs, self.direct, self.channels)
         object.__setattr__(self, "_wires", wire(self.inputs - self.direct, self.layers))
-        last = self.layers[-1]
+        end = self.layers[-1]
         if self.integrate == "last" and not (
-            isinstance(last, Dynamic) and self.likelihood == Gaussian() and not self.direct
+            isinstance(end, Dynamic) and self.likelihood == Gaussian() and not self.direct
         ):
             raise invalid(
                 "integrate",

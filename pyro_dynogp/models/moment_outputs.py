@@ -99,7 +99,9 @@ class MomentOutputs(OutputProcess):
     def prediction_errors(self, y: Tensor, horizon: int, count: int) -> None:
         """None: errors are drawn independently of each other."""
 
-    def state_after(self, y: Tensor, gap: float, next_inputs: Tensor) -> JointState:
+    def state_after(
+        self, y: Tensor, gap: float, next_inputs: Tensor, *, process_noise: bool = True
+    ) -> JointState:
         """See `OutputProcess`; one grid over the past and that time: the filter carries on."""
         time = torch.cat([self.grid.time, self.grid.time[-1:] + gap])
         following = next_inputs
@@ -111,6 +113,8 @@ class MomentOutputs(OutputProcess):
         z = self.scaled(y)
         z = torch.cat([z, torch.full_like(z[..., :1, :], torch.nan)], -2)
         problem = assembly.with_outputs(z)
+        if not process_noise:
+            problem = quiet_last_step(problem)
         elements, batch = problem.elements()
         N = problem.m0.shape[-1]
         ends = each(lambda b: filtering.run(problem.layout, elements[b]), len(elements))
@@ -154,3 +158,24 @@ class MomentOutputs(OutputProcess):
             out[wire.name] = LayerMoments(known + mean[..., own], sd[..., own])
             start += w
         return out
+
+
+def quiet_last_step(problem: FilterProblem) -> FilterProblem:
+    """The problem with no process noise between the last two samples."""
+    step = problem.layout.step.copy()
+    last = int(step[-1])
+    step[-1] = problem.Q.shape[-3]  # a step of its own
+
+    def with_copy(x: Tensor, dim: int) -> Tensor:
+        return torch.cat([x, x.select(dim, last).unsqueeze(dim)], dim)
+
+    Q = with_copy(problem.Q, -3)
+    Q[..., -1, :, :] = 0.0
+    return replace(
+        problem,
+        layout=problem.layout._replace(step=step),
+        re=with_copy(problem.re, -2),
+        im=with_copy(problem.im, -2),
+        gamma=with_copy(problem.gamma, -3),
+        Q=Q,
+    )

@@ -165,11 +165,14 @@ class OutputProcess(TorchDistribution):
         """Every layer's trajectory given the outputs, or given the inputs alone."""
 
     @abstractmethod
-    def state_after(self, y: Tensor, gap: float, next_inputs: Tensor) -> JointState:
+    def state_after(
+        self, y: Tensor, gap: float, next_inputs: Tensor, *, process_noise: bool = True
+    ) -> JointState:
         """State of all dynamic layers given the outputs, `gap` after the last time.
 
         Args:
             y: outputs (*event). gap: [time unit]. next_inputs: u (n_u,) [input] at that time.
+            process_noise: whether there is any in the gap.
         """
 
     def components(self, *, samples: int, seed: int, several_channels: bool = False) -> Components:

@@ -46,7 +46,8 @@ def forecast(
     with torch.no_grad():
         before = output_process(beginning(fit, past, predicting=True), fit.scaling, past)
         ahead = future.tensors().inputs
-        start = before.state_after(past.tensors().observations, gap, ahead[0])
+        y = past.tensors().observations
+        start = before.state_after(y, gap, ahead[0], process_noise=process_noise)
         # Noise that follows the output continues from where the past has brought the output.
         time = np.append(past.time, past.time[-1] + gap + (future.time - future.time[0]))
         system = fit.system if process_noise else fit.system.without_process_noise

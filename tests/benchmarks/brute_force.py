@@ -23,8 +23,8 @@ from pyro_dynogp.criticism.subjects import FitSubject, observed_of
 from pyro_dynogp.inference.methods.optima import posterior_of
 from pyro_dynogp.inference.optimise.maximum import Optimum
 from pyro_dynogp.inference.refit import optima_of, refit
-from pyro_dynogp.models.assembly import assemble
 from pyro_dynogp.models.architectures import Cascade
+from pyro_dynogp.models.assembly import assemble
 from pyro_dynogp.moments import filtering, smoothing
 from pyro_dynogp.moments.problem import each
 from pyro_dynogp.support.checkpoints import NOTHING_KEPT

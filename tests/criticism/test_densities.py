@@ -8,10 +8,11 @@ from scipy.stats import multivariate_normal, norm
 
 import pyro_dynogp as dgp
 from pyro_dynogp.criticism.densities import pointwise_log_density
-from pyro_dynogp.models.outputs import ObservedCascade, collapsed_of
+from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.wiring import Dynamic, Static
 from tests.lti import oracles
 from tests.lti.oracles import random_system, tensor
+from tests.models.outputs import outputs_along
 from tests.moments.joint import linear_cascade
 
 N = 12
@@ -88,8 +89,8 @@ def test_a_linear_cascade_is_the_linear_process(kind):
     time = oracles.irregular_times(N, 5)
     u = oracles.random_inputs(N, 1, 5)
     system, joint, sd, offset = linear_cascade(1, layers, time, u, seed=5, known_start=("g1",))
-    scale, shift = tensor(np.array([2.5])), tensor(np.array([-1.0]))
-    observed = ObservedCascade(system, time, tensor(u), scale, shift)
+    scale, shift = np.array([2.5]), np.array([-1.0])
+    observed = outputs_along(system, time, tensor(u), scale, shift)
     with torch.random.fork_rng():
         torch.manual_seed(1)
         y = observed.sample()
@@ -115,7 +116,7 @@ def test_one_step_densities_of_a_cascade_add_up(likelihood, bent):
         torch.manual_seed(2)
         system = model.collapsed.sample_system(model.scaling)
         states = model.sample_states("")
-    observed = collapsed_of(model.begin(system, states), model.scaling, bent)
+    observed = output_process(model.begin(system, states), model.scaling, bent)
     y = bent.tensors().outputs[:, 0]
     y[5:9] = torch.nan
     total = np.nansum(pointwise_log_density(observed, y, "forecast"))

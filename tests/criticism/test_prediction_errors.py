@@ -10,7 +10,7 @@ import torch
 
 import pyro_dynogp as dgp
 from pyro_dynogp.criticism.comparison import mix
-from pyro_dynogp.prediction.linear import prior_process
+from tests.models.outputs import physical_of, prior_process
 from tests.prediction.known import wiener_data, wiener_fit
 from tests.prediction.test_linear import dense
 
@@ -79,7 +79,7 @@ def test_errors_are_those_of_simulated_records(map_fit, record):
     process = prior_process(map_fit, short)
     with torch.random.fork_rng(), torch.no_grad():
         torch.manual_seed(5)
-        y = process.observed(map_fit.system.noise_sd).sample((400,))[:, 0].numpy()
+        y = process.observed(physical_of(map_fit).noise_sd).sample((400,))[:, 0].numpy()
     real = np.stack(
         [
             one - map_fit.predict(short.with_outputs(one), horizon=K, samples=1).mean[:, 0]
@@ -99,7 +99,7 @@ def test_calibration_several_steps_ahead_keeps_its_level(map_fit, record):
     process = prior_process(map_fit, short)
     with torch.random.fork_rng(), torch.no_grad():
         torch.manual_seed(1)
-        y = process.observed(map_fit.system.noise_sd).sample((48,))[:, 0].numpy()
+        y = process.observed(physical_of(map_fit).noise_sd).sample((48,))[:, 0].numpy()
     joint, apart = [], []
     for seed, one in enumerate(y):
         measured = short.with_outputs(one)
@@ -162,10 +162,12 @@ def test_a_first_state_that_is_a_site(record):
     prior = fit.log_joint(record[:60]) - _outputs_given(fit, sites, record[:60])
     assert float(data.sample_stats["lp"][0, 0]) == pytest.approx(total + prior)
     unknown = prior_process(fit, record[:60], unknown_start=True)
-    integrated = unknown.observed(fit.system.noise_sd).log_prob(record.tensors().outputs[:60, 0])
+    integrated = unknown.observed(physical_of(fit).noise_sd).log_prob(
+        record.tensors().outputs[:60, 0]
+    )
     assert abs(total - float(integrated[0])) > 0.1
     other = record[60:120]
-    same = prior_process(fit, other).observed(fit.system.noise_sd)
+    same = prior_process(fit, other).observed(physical_of(fit).noise_sd)
     assert float(fit.log_likelihood(other)[0]) == pytest.approx(
         float(same.log_prob(other.tensors().outputs[:, 0])[0])
     )

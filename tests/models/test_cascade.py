@@ -317,7 +317,7 @@ def test_a_path_is_one_function(name):
     assert (nodes(model, record, without)[one.name]["value"] - f).abs().max() > 1e-3
 
 
-@pytest.mark.parametrize("initial_state", ["site", "integrated", "zero"])
+@pytest.mark.parametrize("initial_state", ["auto", "integrated", "zero"])
 def test_initial_state_is_a_site_where_a_static_layer_sees_it(initial_state):
     for name, expected in {
         "linear": [],
@@ -330,7 +330,7 @@ def test_initial_state_is_a_site_where_a_static_layer_sees_it(initial_state):
     }.items():
         raw = MODELS[name]()
         model = dgp.Cascade(raw.inputs, raw.layers, initial_state=initial_state)
-        wanted = expected if initial_state == "site" else []
+        wanted = expected if initial_state == "auto" else []
         assert [one.name for one in model.state_sites] == wanted, name
     # A layer before a dynamic one that a static layer sees is below that one all the same.
     model = dgp.Cascade(1, (Dynamic(pairs=1), Dynamic(pairs=1), Static()))
@@ -352,12 +352,12 @@ def test_limits_of_a_sensor_are_in_the_unit_of_the_output():
         "f_center": torch.zeros(1).double(), "f_half_width": torch.ones(1).double(),
         "f_values": torch.zeros(1, 4).double(),
     }  # fmt: skip
-    function = model.scaled_to(record).static_given(f, f.layer, values)
+    function = model.scaled_to(record).static_function(f, f.layer, values)
     x = torch.linspace(-9.0, 9.0, 50).double().unsqueeze(-1)
     expected = np.clip(offset + scale * x.numpy(), low, high)
     assert np.allclose(offset + scale * function.mean(x).numpy(), expected, rtol=1e-12)
     with pytest.raises(ValueError, match="scaling: expected that of the training record"):
-        model.static_given(f, f.layer, values)
+        model.static_function(f, f.layer, values)
 
 
 @pytest.mark.parametrize("integrate", ["none", "all"])
@@ -402,7 +402,7 @@ def test_first_state_acts_on_the_beginning():
     ({"likelihood": "gaussian"}, "likelihood: expected Gaussian"),
     ({"priors": "none"}, "priors: expected 'default' or 'paper'"),
     ({"integrate": "first"}, "integrate: expected 'none', 'last' or 'all'"),
-    ({"initial_state": "random"}, "initial_state: expected 'site'"),
+    ({"initial_state": "random"}, "initial_state: expected 'auto', 'site'"),
     ({"integrate": "last", "likelihood": dgp.StudentT()}, "only a dynamic last layer"),
     ({"integrate": "last", "likelihood": dgp.Heteroscedastic()}, "only a dynamic last layer"),
     ({"integrate": "last", "layers": (Dynamic(), Static())}, "only a dynamic last layer"),

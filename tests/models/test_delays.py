@@ -62,12 +62,12 @@ def test_a_late_input_does_not_spoil_the_poles(record: dgp.Record) -> None:
     # Of 292 samples the noise's sd is known to 1 / sqrt(2 * 292) = 4 %, a pole at noise of 2 % to
     # less; without the mending the noise is off by two thirds.
     assert poles_of(found)[0] * STEP == pytest.approx(POLE, rel=0.02)
-    noise = float(found.system.noise_sd.mean()) * found.scaling.output_scale[0]
+    noise = found.noise_sd[0] * found.scaling.output_scale[0]
     assert noise == pytest.approx(NOISE, rel=0.15)
     late = np.concatenate([np.full(LATE, record.inputs[0, 0]), record.inputs[:-LATE, 0]])
     held = dgp.Record(record.time, late, record.outputs[:, 0])
     spoilt = quick_fit(MODEL, held, 0)
-    assert float(spoilt.system.noise_sd.mean()) * spoilt.scaling.output_scale[0] > 1.4 * NOISE
+    assert spoilt.noise_sd[0] * spoilt.scaling.output_scale[0] > 1.4 * NOISE
 
 
 def test_residuals_are_missing_where_inputs_are_not_known(record: dgp.Record) -> None:

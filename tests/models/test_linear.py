@@ -10,7 +10,8 @@ from pyro.infer.inspect import get_model_relations
 
 import pyro_dynogp as dgp
 from pyro_dynogp.lti.covariance import real_covariance
-from pyro_dynogp.models.linear import initial_mean, past_input_covariance
+from pyro_dynogp.models.outputs import output_process
+from pyro_dynogp.models.priors import past_input_covariance
 
 
 def latent(trace):
@@ -38,7 +39,7 @@ def test_every_site_changes_the_likelihood(record, initial_state, priors):
     model = dgp.LinearDynamicGP(inputs=1, pairs=2, initial_state=initial_state, priors=priors)
     start = dgp.LinearDynamicGP(inputs=1, pairs=2, initial_state=initial_state)
     values = latent(draw(start, record))
-    assert ("initial_state" in values) == (initial_state == "site")
+    assert ("g_initial_state" in values) == (initial_state == "site")
 
     def likelihood(v):
         trace = pyro.poutine.trace(pyro.poutine.condition(model, data=v)).get_trace(record)
@@ -94,9 +95,8 @@ def test_likelihood_is_in_the_units_of_the_record(record):
     trace = draw(model, short)
     trace.compute_log_prob()
     values = latent(trace)
-    with pyro.poutine.condition(data=values):
-        system = model.sample_system(model.scaling)
-    process = model.process(system, short, model.scaling)
+    observed = output_process(model.system(values, model.scaling), model.scaling, short).process
+    system, process = model.system(values, model.scaling).physical(model.scaling), observed.process
     S = signal_covariance(system.modes, short.time, short.time, process.initial_covariance)
     K = S + system.noise_sd**2 * torch.eye(40, dtype=torch.float64)
     dense = multivariate_normal(process.mean.numpy(), K.numpy()).logpdf(short.outputs[:, 0])
@@ -111,21 +111,18 @@ def test_integrated_initial_state_is_the_average_over_sampled_ones(record):
     values = latent(draw(integrated, short, seed=4))
     # Noise so large that the sampled states overlap the likelihood.
     values["noise_sd"] = torch.tensor([1.5], dtype=torch.float64)
-    with pyro.poutine.condition(data=values):
-        system = integrated.sample_system(integrated.scaling)
+    system = integrated.system(values, integrated.scaling)
     count = 40_000
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        states = initial_mean(system.past_inputs, torch.randn(count, 2).double())
+        states = torch.randn(count, 2).double()
     y = torch.as_tensor(short.outputs[:, 0].copy())
-    given = sampled.process(system, short, sampled.scaling, states)
-    conditional = given.observed(system.noise_sd).log_prob(y)
+    begun = sampled.begin(system, {"g": states})
+    conditional = output_process(begun, sampled.scaling, short).log_prob(y)
     average = float(torch.logsumexp(conditional, 0) - math.log(count))
     ratio = (conditional - conditional.max()).exp()
     error = float(ratio.std() / ratio.mean()) / math.sqrt(count)
-    exact = float(
-        integrated.process(system, short, integrated.scaling).observed(system.noise_sd).log_prob(y)
-    )
+    exact = float(output_process(system, integrated.scaling, short).log_prob(y))
     assert error < 0.05
     assert abs(average - exact) < 4 * error
 
@@ -181,7 +178,7 @@ def test_intervention_and_conditioning(record):
     model = dgp.LinearDynamicGP(inputs=1, pairs=1)
     fixed = pyro.do(model, data={"noise_sd": torch.tensor([0.5], dtype=torch.float64)})
     trace = draw(fixed, record)
-    assert float(trace.nodes["y"]["fn"].noise_variance.reshape(-1)[0]) == pytest.approx(
+    assert float(trace.nodes["y"]["fn"].process.noise_variance.reshape(-1)[0]) == pytest.approx(
         (0.5 * record.outputs.std()) ** 2
     )
 
@@ -190,10 +187,10 @@ def test_intervention_and_conditioning(record):
     ("options", "message"),
     [
         ({"inputs": -1}, "inputs: expected a whole number >= 0"),
-        ({"inputs": 1, "outputs": 0}, "outputs: expected a whole number >= 1"),
-        ({"inputs": 1, "pairs": 0}, "pairs"),
+        ({"inputs": 1, "outputs": 0}, "outputs of layer 'g'"),
+        ({"inputs": 1, "pairs": 0}, "pairs of layer 'g'"),
         ({"inputs": 1, "pairs": 2.0}, "pairs"),
-        ({"inputs": 1, "noise": "white"}, "noise: expected 'shared' or 'independent'"),
+        ({"inputs": 1, "noise": "white"}, "noise of layer 'g': expected 'shared' or 'independent'"),
         ({"inputs": 1, "initial_state": "random"}, "initial_state"),
         ({"inputs": 1, "priors": "none"}, "priors"),
         ({"inputs": 0, "process_noise": False}, "process_noise"),

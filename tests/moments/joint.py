@@ -8,7 +8,7 @@ import torch
 from pyro_dynogp.layers.functions import StaticFunction
 from pyro_dynogp.layers.kernels import SampledKernel, _default_form
 from pyro_dynogp.layers.noise import Gaussian, Noise
-from pyro_dynogp.models.system import System, DynamicSystem, StaticSystem
+from pyro_dynogp.models.system import DynamicSystem, StaticSystem, System
 from pyro_dynogp.models.wiring import Dynamic, wire
 from tests.lti import oracles
 from tests.lti.oracles import tensor

@@ -9,11 +9,12 @@ import torch
 from pyro_dynogp.distributions.process import LTIProcess
 from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.models.assembly import assemble
-from pyro_dynogp.models.outputs import ObservedCascade
+from pyro_dynogp.models.moment_outputs import MomentOutputs
 from pyro_dynogp.models.wiring import Dynamic, Static
 from pyro_dynogp.moments import filtering, smoothing
 from tests.lti import oracles
 from tests.lti.oracles import NOISES, assert_close, tensor
+from tests.models.outputs import outputs_along
 from tests.moments.joint import linear_cascade
 from tests.moments.problems import element
 
@@ -105,8 +106,8 @@ def test_log_density(name, noise):
     case = case_of(name, noise)
     scale, shift = np.linspace(2.0, 3.0, len(case.sd)), np.full(len(case.sd), -1.0)
     y = shift + scale * case.y
-    observed = ObservedCascade(
-        case.system, case.time, tensor(case.inputs), tensor(scale), tensor(shift)
+    observed = outputs_along(
+        case.system, case.time, tensor(case.inputs), scale, shift, engine=MomentOutputs
     )
     expected = case.joint.log_density(case.last, case.sd, case.y - case.offset)
     expected -= ((~np.isnan(y)) * np.log(scale)).sum()
@@ -223,8 +224,7 @@ def test_one_dynamic_layer_is_the_linear_gaussian_process(name, noise):
     driven = tensor(case.inputs) if layer.modes.inputs else None
     process = LTIProcess(layer.modes, case.time, driven, layer.prior_state(), offset=offset)
     y = tensor(case.y if several else case.y[:, 0])
-    one = torch.ones(len(case.sd), dtype=torch.float64)
-    observed = ObservedCascade(case.system, case.time, tensor(case.inputs), one, 0.0 * one)
+    observed = outputs_along(case.system, case.time, tensor(case.inputs), engine=MomentOutputs)
     exact = process.observed(sd).log_prob(y)
     torch.testing.assert_close(observed.log_prob(y), exact, rtol=1e-9, atol=0.0)
     noiseless = process.condition(y, sd)

@@ -10,11 +10,12 @@ from scipy.stats import norm
 from pyro_dynogp.layers.functions import StaticFunction
 from pyro_dynogp.layers.kernels import SampledKernel, _default_form
 from pyro_dynogp.layers.noise import Gaussian, Noise
-from pyro_dynogp.models.outputs import ObservedCascade
-from pyro_dynogp.models.system import System, DynamicSystem, StaticSystem
+from pyro_dynogp.models.moment_outputs import MomentOutputs
+from pyro_dynogp.models.system import DynamicSystem, StaticSystem, System
 from pyro_dynogp.models.wiring import Dynamic, Static, wire
 from tests.lti import oracles as lti
 from tests.lti.oracles import tensor
+from tests.models.outputs import outputs_along
 from tests.moments.wiener import Wiener, particle_filter
 
 
@@ -94,12 +95,11 @@ def test_wiener_hammerstein_by_particles(seed):
     )
     noise = Noise(Gaussian(), torch.tensor([sd], dtype=torch.float64), None)
     system = System(wires, layers, noise, torch.tensor([0.4], dtype=torch.float64))
-    one = torch.ones(1, dtype=torch.float64)
-    observed = ObservedCascade(system, time, tensor(u), one, 0.0 * one)
+    observed = outputs_along(system, time, tensor(u), engine=MomentOutputs)
     value = float(observed.log_prob(tensor(y)))
     assert abs(value - np.mean(totals)) < 1.2 + 2.0 * np.std(totals)
     # Taking the first layer for certain costs many times as much (27 nats or more).
     certain = replace(layers[0], modes=first.modes.without_process_noise())
     system = replace(system, layers=(certain, *layers[1:]))
-    observed = ObservedCascade(system, time, tensor(u), one, 0.0 * one)
+    observed = outputs_along(system, time, tensor(u), engine=MomentOutputs)
     assert float(observed.log_prob(tensor(y))) < value - 10.0

@@ -8,7 +8,7 @@ import torch
 import pyro_dynogp as dgp
 from pyro_dynogp.lti.dense import signal_covariance
 from pyro_dynogp.lti.state import ModalState
-from pyro_dynogp.prediction.linear import prior_process
+from tests.models.outputs import physical_of, prior_process
 
 
 def dense(fit, record, draw=0):
@@ -17,7 +17,7 @@ def dense(fit, record, draw=0):
     modes = process.modes[draw]
     P0 = process.initial_covariance
     S = signal_covariance(modes, record.time, record.time, P0 if P0 is None else P0[draw])
-    noise = np.atleast_1d(fit.system.noise_sd[draw].numpy()) ** 2
+    noise = np.atleast_1d(physical_of(fit).noise_sd[draw].numpy()) ** 2
     return process.mean[draw].reshape(-1).numpy(), S.numpy(), np.tile(noise, len(record))
 
 
@@ -205,7 +205,7 @@ def test_wrong_uses(map_fit, record, two_outputs):
     past, future = record.split(160)
     with pytest.raises(ValueError, match="future: expected times after the end of past"):
         map_fit.forecast(future, past)
-    with pytest.raises(ValueError, match="horizon: expected a whole number of samples >= 1"):
+    with pytest.raises(ValueError, match="horizon: expected a whole number >= 1"):
         map_fit.predict(record, horizon=0)
     with pytest.raises(ValueError, match="expected 1 inputs, as the model has, got 2"):
         map_fit.simulate(two_outputs)

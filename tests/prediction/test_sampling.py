@@ -10,14 +10,13 @@ import torch
 import pyro_dynogp as dgp
 from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.models import draws as sampling
-from pyro_dynogp.models.assembly import assemble
 from pyro_dynogp.models.draws import (
     JointState,
     Randomness,
     Switches,
     draw_layers,
+    first_state,
     fresh_noise,
-    known_start,
 )
 from pyro_dynogp.models.wiring import Dynamic, Static
 from tests.lti import oracles
@@ -38,7 +37,7 @@ def cascade(seed=0, known=()):
     u = oracles.random_inputs(14, 1, seed)
     system, joint, _, offset = linear_cascade(1, LAYERS, time, u, seed=seed,
                                               known_start=known)  # fmt: skip
-    start = JointState(known_start(system), assemble(system, time_grid(time), tensor(u)).problem.P0)
+    start = first_state(system)
     return system, joint, offset, time_grid(time), tensor(u), start
 
 
@@ -90,7 +89,7 @@ def test_each_switch_acts_on_its_own_layers_only(cause):
         system = model.sample_system(model.scaling)
     grid = time_grid(record.time)
     u = torch.zeros(len(record), 1, dtype=torch.float64)
-    start = JointState(known_start(system), assemble(system, grid, u).problem.P0)
+    start = first_state(system)
     random = random_numbers(system, len(grid))
     on = {
         "initial_state": Switches(True, frozenset(), False),
@@ -112,7 +111,7 @@ def test_all_on_names_the_layers_that_have_process_noise():
     model, _ = case("Wiener-Hammerstein")
     system = model.sample_system(model.scaling)
     assert Switches.all_on(system).process_noise == {"g1", "g2"}
-    assert Switches.all_on(system, process_noise=False).process_noise == frozenset()
+    assert Switches.all_on(system.without_process_noise).process_noise == frozenset()
 
 
 @pytest.mark.parametrize("noise", NOISES)
@@ -138,7 +137,7 @@ def test_root_of_a_singular_covariance():
 
 def test_known_start_orders_real_parts_before_imaginary_ones():
     system, *_ = cascade(known=("g2",))
-    start = known_start(system)
+    start = first_state(system).mean
     state = system.layer("g2").first_state
     assert start.shape == (8,)
     assert torch.equal(start, torch.cat([0 * state.real, state.real, 0 * state.imag, state.imag]))
@@ -176,7 +175,7 @@ def test_functions_of_several_channels_are_at_their_mean_as_in_the_filter():
         system = model.collapsed.sample_system(model.scaling)
     grid = time_grid(record.time)
     u = 30.0 * torch.sin(grid.time).unsqueeze(-1)
-    start = JointState(known_start(system), assemble(system, grid, u).problem.P0)
+    start = first_state(system)
     random = random_numbers(system, len(grid), 4)
     plain = Switches(False, frozenset(), True)
     by_filter = draw_layers(system, grid, u, start, random, plain).signals["f"]

@@ -9,12 +9,14 @@ import torch
 
 import pyro_dynogp as dgp
 from pyro_dynogp.inference.density import Potential, denormals_flushed
-from pyro_dynogp.lti.grid import time_grid
-from pyro_dynogp.models import known
+from pyro_dynogp.layers.noise import Noise
+from pyro_dynogp.models import outputs
+from pyro_dynogp.models.exact_outputs import ExactOutputs, has_exact_density
 from pyro_dynogp.models.wiring import Dynamic, Static
 from tests.lti import oracles
 from tests.lti.oracles import tensor
 from tests.models.cascades import make_record
+from tests.models.outputs import outputs_along
 from tests.moments.joint import linear_cascade
 
 QUIET, NOISY = Dynamic(pairs=2, process_noise=False), Dynamic(pairs=2)
@@ -45,7 +47,7 @@ def test_the_density_is_that_of_the_joint_gaussian(name, gaps):
     u = oracles.random_inputs(N, inputs, 4)
     start = ("g1", "g", "end") if name != "one layer" else ()
     system, joint, sd, offset = linear_cascade(inputs, layers, time, u, seed=5, known_start=start)
-    assert known.has_exact_density(system)
+    assert has_exact_density(system)
     last = system.wires[-1].name
     i = joint.index(last)
     rng = np.random.default_rng(6)
@@ -54,8 +56,8 @@ def test_the_density_is_that_of_the_joint_gaussian(name, gaps):
         y[[1, 8]] = np.nan
         y[12, -1] = np.nan
     expected = joint.log_density(last, sd, y - offset)
-    grid = time_grid(time)
-    found = known.log_density(system, grid, tensor(u), tensor(y))
+    value = tensor(y if i.shape[-1] > 1 else y[:, 0])
+    found = outputs_along(system, time, tensor(u), engine=ExactOutputs).log_prob(value)
     assert float(found) == pytest.approx(expected, rel=1e-9)
 
 
@@ -63,14 +65,17 @@ def test_what_needs_the_filter():
     time, u = oracles.irregular_times(N, 3), oracles.random_inputs(N, 1, 4)
 
     def exact(*layers, start=("g1",)):
-        return known.has_exact_density(linear_cascade(1, layers, time, u, known_start=start)[0])
+        return has_exact_density(linear_cascade(1, layers, time, u, known_start=start)[0])
 
     assert exact(QUIET, Static(), NOISY)
     assert not exact(NOISY, Static(), QUIET)
     assert not exact(QUIET, Static(), NOISY, start=())
     assert not exact(QUIET, Static(), NOISY, Static())
-    heavy = replace(linear_cascade(1, (NOISY,), time, u)[0], noise=dgp.StudentT().sample(1, 1))
-    assert not known.has_exact_density(heavy)
+    heavy = replace(
+        linear_cascade(1, (NOISY,), time, u)[0],
+        noise=Noise(dgp.StudentT(), torch.ones(1).double(), None),
+    )
+    assert not has_exact_density(heavy)
 
 
 MODELS = {
@@ -123,7 +128,7 @@ def test_value_and_gradient(name, monkeypatch):
         up, down = (potential.value_and_gradient(z + s)[0] for s in (step, -step))
         assert gradient[i] == pytest.approx((up - down) / 2e-5, rel=1e-5, abs=1e-4)
     # The filter interpolates functions of one channel in a table of 801 points.
-    monkeypatch.setattr(known, "has_exact_density", lambda system: False)
+    monkeypatch.setattr(outputs, "has_exact_density", lambda system: False)
     assert value == pytest.approx(potential.value_and_gradient(z)[0], rel=1e-4, abs=1e-2)
 
 
