@@ -104,7 +104,7 @@ def fit(
     """
     cascade = model.has_function
     if method is None:
-        method = "svi" if cascade else "map"
+        method = "svi" if cascade or guide not in (None, "collapsed") else "map"
     if method not in ("map", "svi", "nuts"):
         raise invalid("method", expected="'map', 'svi' or 'nuts'", got=repr(method))
     if optimizer is None:
@@ -125,7 +125,7 @@ def fit(
             expected="'map', 'normal' or 'multivariate normal'",
             got=repr(hyperparameters),
         )
-    if guide is not None and model.is_linear and model.likelihood.gaussian:
+    if guide is not None and model.is_linear and model.integrate == "all":
         raise invalid("guide", expected="None for a linear model, which is exact", got=repr(guide))
     if start is not None and guide not in (None, "collapsed"):
         raise invalid("start", expected="None with this guide", got="a fit")

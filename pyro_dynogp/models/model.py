@@ -270,16 +270,24 @@ class Model:
         modes = self._modes_prior(place, layer, time_scale).modes(values)
         return DynamicSystem(modes, 1.0 / time_scale.typical_rate)
 
-    def static_function(self, place: Wire, layer: Static, values: Values) -> StaticFunction:
-        """The function of a static layer at values of its sites."""
-        return self._static_system(place, layer, values, self.scaling).function
+    def static_function(
+        self, place: Wire, layer: Static, values: Values, scaling: Scaling | None = None
+    ) -> StaticFunction:
+        """The function of a static layer at values of its sites.
+
+        Args:
+            place, layer: which one. values: of its sites.
+            scaling: of the training record, by default the model's; for a layer with limits.
+        """
+        function = self._static_prior(place, layer).function(values)
+        if layer.limits is None:
+            return function
+        return replace(function, limits=scaled_limits(layer.limits, scaling or self.scaling))
 
     def _static_system(
-        self, place: Wire, layer: Static, values: Values, scaling: Scaling | None
+        self, place: Wire, layer: Static, values: Values, scaling: Scaling
     ) -> StaticSystem:
-        function = self._static_prior(place, layer).function(values)
-        if layer.limits is not None:
-            function = replace(function, limits=scaled_limits(layer.limits, scaling))
+        function = self.static_function(place, layer, values, scaling)
         if not self._has_residual(place):
             return StaticSystem(function)
         support = support_points(function.locations, layer.support)

@@ -9,7 +9,7 @@ import torch
 import pyro_dynogp as dgp
 from pyro_dynogp.criticism import simulation_based
 from pyro_dynogp.criticism.posterior_draws import PosteriorDraws
-from pyro_dynogp.criticism.simulation_based import _FixedCascade, _simulated, _Task
+from pyro_dynogp.criticism.simulation_based import _Fixed, _simulated, _Task
 from pyro_dynogp.inference.fitted import Fit
 
 QUIET = {"workers": 1, "progress": False}
@@ -110,7 +110,7 @@ def test_an_overconfident_posterior_is_rejected(model, blank, monkeypatch, width
 
 def test_outputs_of_a_cascade_come_from_its_trajectories(blank):
     wiener = dgp.Wiener(1, pairs=1, inducing=4).scaled_to(blank)
-    fixed = _FixedCascade(**{f.name: getattr(wiener, f.name) for f in fields(wiener)})
+    fixed = _Fixed(**{f.name: getattr(wiener, f.name) for f in fields(wiener)})
     blind = blank.with_outputs(np.empty((24, 0)), names=(), units=())
     truth, record = _simulated(_Task(fixed, blind, blank.missing, "svi", 19, 3, {}))
     assert {"g", "f", "f_values", "g_initial_state"} <= set(truth)

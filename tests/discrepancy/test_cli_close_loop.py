@@ -90,7 +90,7 @@ def test_end_to_end(folder, seen, tmp_path):
     assert tuple(record.extra) == ("ambient", "feed")
     assert dict(record.extra_units) == {"ambient": "K", "feed": ""}
     assert fitted.training == (record[:130].fingerprint,)
-    assert fitted.model.pairs == 1
+    assert fitted.model.layers[0].pairs == 1
     assert (seen["seed"], seen["rounds"], seen["candidates"]) == (3, 2, None)
     assert (seen["workers"], seen["progress"]) == (1, False)
     report = reports.report(fit=fitted, base=fitted)

@@ -200,7 +200,7 @@ def test_a_drift_goes_on_as_held_out_data_say(bends: bool) -> None:
     )
     assert [one.name for one in report.effects] == ["drift"]
     model = report.fit.model
-    assert (model.pairs == 2) is bends  # a random path
+    assert (model.layers[0].pairs == 2) is bends  # a random path
     assert bool(model.channels) is not bends  # a line
     # The noise's own is 0.05. What is left of the bend is small; a line would go on to 0.26.
     assert report.after["rmse"] < (0.1 if bends else 0.06)

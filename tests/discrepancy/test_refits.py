@@ -13,7 +13,7 @@ from pyro_dynogp.data.channels import Delayed, Recorded, Trend
 from pyro_dynogp.discrepancy import refits
 from pyro_dynogp.discrepancy.refits import energy, quick_fit, race
 from pyro_dynogp.discrepancy.search import candidates_of
-from pyro_dynogp.models.variants import as_cascade, with_channel, without_process_noise
+from pyro_dynogp.models.variants import with_channel, without_process_noise
 from tests.discrepancy.made import coloured
 from tests.discrepancy.plant_dynamics import System, response
 from tests.discrepancy.test_decision import spoken_for, two_inputs
@@ -93,8 +93,8 @@ def test_other_noise_goes_on_from_a_linear_base(record, monkeypatch):
     spoilt = record.with_outputs(outliers)
     base = quick_fit(later(LATE), spoilt, 0)
     monkeypatch.delattr(refits, "_fresh")  # another climb from the beginning is not needed
-    robust = replace(as_cascade(later(LATE)), likelihood=dgp.StudentT())
-    plain = as_cascade(later(LATE))
+    robust = replace(later(LATE), likelihood=dgp.StudentT())
+    plain = later(LATE)
     found, _ = race([plain, robust], spoilt, base, 0)
     first, second = found
     assert replace(first.model, scaling=None) == robust
@@ -130,7 +130,7 @@ def test_a_saturation_knows_its_limits_and_a_function_goes_on_as_a_line():
     assert (bends.mean, bends.limits) == ("linear", None)
     # Which output they are of is not known, or something comes on top of the sensor.
     for model in (
-        replace(MODEL, outputs=2),
+        replace(MODEL, layers=(replace(MODEL.layers[0], outputs=2),)),
         with_channel(MODEL, Trend(0.0, 1.0)),
     ):
         assert last(effects.Saturation(), model, limits).limits is None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,6 +16,7 @@ from pyro_dynogp.discrepancy.rounds import Looked, Rounds
 from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.discrepancy.state import Course
 from pyro_dynogp.discrepancy.trials import without
+from pyro_dynogp.models.variants import has_process_noise, without_process_noise
 from pyro_dynogp.statistics.evidence import Evidence
 
 from .series import residuals, share
@@ -50,7 +50,7 @@ def test_process_noise_that_costs_forecasts_is_pointed_out(late, noise, hides):
 
 
 def test_a_fit_without_process_noise_hides_nothing(rounds):
-    model = dataclasses.replace(MODEL, process_noise=False)
+    model = without_process_noise(MODEL)
     fit = dgp.fit(model, rounds.data.known[:240], restarts=1, workers=1, progress=False)
     assert rounds.plain(fit) is fit
     assert rounds.hiding(fit, rounds.plain(fit)) == ""
@@ -136,15 +136,15 @@ def test_the_search_goes_on_without_process_noise_that_hides_what_is_missing():
     assert [one.name for one in report.effects] == ["dead time"]
     assert sum("the extended model has it again" in one for one in report.warnings) == 1
     assert report.after["rmse"] < 0.05 < report.before["rmse"]  # the noise is 0.02
-    assert report.base.model.process_noise
-    assert report.fit.model.process_noise  # which is back where it does no harm
+    assert has_process_noise(report.base.model)
+    assert has_process_noise(report.fit.model)  # which is back where it does no harm
 
 
 class OnlyBesideNoise(effects.LevelShift):
     """A step that cannot be added to a model without process noise."""
 
     def extend(self, model, evidence, record):
-        return super().extend(model, evidence, record) if model.process_noise else []
+        return super().extend(model, evidence, record) if has_process_noise(model) else []
 
 
 @pytest.mark.parametrize(
@@ -169,7 +169,7 @@ def test_where_nothing_can_be_added_without_process_noise_the_search_begins_agai
     assert report.after["rmse"] < 0.7 * report.before["rmse"]
     assert sum(said in one for one in report.warnings) == 1
     again = effect is OnlyBesideNoise
-    assert report.fit.model.process_noise == again
+    assert has_process_noise(report.fit.model) == again
     assert {one.round for one in report.attempts if one.decision == "accepted"} == {1 + again}
 
 
@@ -205,7 +205,7 @@ def test_what_goes_with_inputs_under_feedback_is_not_tried(effect, p, certain, f
 )
 def test_what_was_done_about_noise_that_hides_is_said(noise, accepted, returned, said):
     first, current = (
-        SimpleNamespace(model=dataclasses.replace(MODEL, process_noise=one)) for one in noise
+        SimpleNamespace(model=MODEL if one else without_process_noise(MODEL)) for one in noise
     )
     course = SimpleNamespace(
         hidden="forecasts better", first=first, current=current, accepted=accepted,

@@ -60,8 +60,9 @@ def test_what_has_grown_starts_at_the_likelihood_of_its_base(record, base, more)
     records = extended.check(record[:TRAINING])
     target = extended.scaled_to(records).collapsed
     (start,) = starting_points(target, records, 1, 5, 0, 1, False, NOTHING_KEPT)
+    sites = target.all_sites(target.scaling, 1)
     before = log_likelihood(base.model.collapsed, base.model.check(record[:TRAINING]), base.mode)
-    after = log_likelihood(target, records, grown(base.mode, start, silent=True))
+    after = log_likelihood(target, records, grown(base.mode, start, sites))
     loud = log_likelihood(target, records, grown(base.mode, start))
     # A new pair has a little process noise already.
     assert after == pytest.approx(before, rel=1e-9 if more == "channel" else 1e-2)
@@ -122,4 +123,4 @@ def test_models_without_process_noise_stay_as_they_are():
         dgp.Cascade(1, (dgp.Dynamic(pairs=1, process_noise=False),)),
     ):
         assert without_process_noise(model) == model
-    assert not without_process_noise(dgp.LinearDynamicGP(1)).process_noise
+    assert not without_process_noise(dgp.LinearDynamicGP(1)).layers[0].process_noise

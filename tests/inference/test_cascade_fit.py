@@ -74,7 +74,7 @@ def test_one_dynamic_layer_is_the_linear_model(record):
     """Densities of the two at the optimum, by another code path each; all sites in one normal."""
     train = record[:60]
     model = dgp.Cascade(1, (dgp.Dynamic(pairs=1),), priors="paper")
-    cascade = dgp.fit(model, train, hyperparameters="multivariate normal", **FAST)
+    cascade = dgp.fit(model, train, method="svi", **FAST)
     assert isinstance(cascade.posterior, GaussianGuide)
     assert all(bool((v[0] != v[-1]).any()) for v in cascade.draws.values())
     # Flat priors: by default gains of a layer, which has unit scale, have a narrower one.
@@ -321,7 +321,8 @@ class TestErrors:
     def test_point_estimates_of_a_cascade_without_static_layers(self, record):
         model = dgp.Cascade(1, (dgp.Dynamic(pairs=1),))
         with pytest.raises(ValueError, match="hyperparameters: expected 'normal' or"):
-            dgp.fit(model, record[:40], **{**FAST, "steps": 1})
+            dgp.fit(model, record[:40], method="svi", hyperparameters="map",
+                    **{**FAST, "steps": 1})  # fmt: skip
 
 
 def test_divergence_names_parameters_and_keeps_the_last_good_ones(bent):

@@ -4,9 +4,9 @@ import torch
 
 import pyro_dynogp as dgp
 from pyro_dynogp.inference.methods import mode as cascade_fit
-from pyro_dynogp.inference.methods.mode import without_process_noise
 from pyro_dynogp.inference.optimise.maximum import maximise
 from pyro_dynogp.inference.starts.plans import plans
+from pyro_dynogp.models.variants import without_noise_below_functions
 from pyro_dynogp.models.wiring import Dynamic, Static
 from tests.inference.cascades import wiener
 
@@ -45,7 +45,7 @@ class TestPlans:
 
 
 def test_without_process_noise():
-    quiet = without_process_noise(dgp.WienerHammerstein(1, pairs=2))
+    quiet = without_noise_below_functions(dgp.WienerHammerstein(1, pairs=2))
     assert [one.process_noise for one in quiet.layers if isinstance(one, Dynamic)] == [False] * 2
     assert [one.name for one in quiet.wires] == ["g1", "f", "g2"]
     for model in (
@@ -54,11 +54,11 @@ def test_without_process_noise():
         dgp.WienerHammerstein(1, pairs=2, process_noise=(False, True)),
         dgp.Cascade(1, (Dynamic(pairs=2),)),
     ):
-        assert without_process_noise(model) == model
+        assert without_noise_below_functions(model) == model
     # What nothing else drives keeps its noise.
     layers = (Dynamic(pairs=1), Static(inducing=4))
     alone = dgp.Cascade(0, layers)
-    assert without_process_noise(alone).layers[0].process_noise
+    assert without_noise_below_functions(alone).layers[0].process_noise
 
 
 def test_starts_climb_without_process_noise_first(monkeypatch, bent):

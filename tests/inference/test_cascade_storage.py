@@ -141,7 +141,9 @@ def test_every_model_comes_back(name, tmp_path, bent):
     again = dgp.load(tmp_path / "fit")
     assert_equal(fit, again)
     assert again.model.layers == MODELS[name].layers
-    assert np.array_equal(fit.predict(bent).mean, again.predict(bent).mean)
+    # Draws of flat priors exceed floating-point range.
+    pair = (fit.predict(bent).mean, again.predict(bent).mean)
+    assert np.array_equal(*pair, equal_nan=MODELS[name].priors == "paper")
 
 
 def test_several_records(tmp_path, bent):
@@ -172,7 +174,7 @@ def test_a_guide_with_first_states_of_several_records(tmp_path, bent):
 def test_a_linear_guide_with_a_first_state(tmp_path, map_fit, record):
     """Its site comes after those of the parameters, and belongs to the normal too."""
     model = replace(map_fit.model, initial_state="site")
-    values = {**map_fit.mode, "initial_state": torch.zeros(2, dtype=torch.float64)}
+    values = {**map_fit.mode, "g_initial_state": torch.zeros(2, dtype=torch.float64)}
     potential = Potential(model, (record,), values)
     root = torch.eye(potential.size, dtype=torch.float64)
     fit = replace(
@@ -186,7 +188,7 @@ def test_a_linear_guide_with_a_first_state(tmp_path, map_fit, record):
     fit.save(tmp_path / "fit")
     again = dgp.load(tmp_path / "fit")
     assert [s.name for s in again.posterior.sites] == [s.name for s in fit.posterior.sites]
-    assert "initial_state" in again.guide(record)
+    assert "g_initial_state" in again.guide(record)
 
 
 def test_a_kernel_of_gpytorch_is_refused(tmp_path, bent):

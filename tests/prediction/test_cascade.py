@@ -307,7 +307,7 @@ class TestWiener:
         assert not np.array_equal(one.mean, other.mean)
         assert torch.equal(torch.get_rng_state(), state)
 
-    def test_wrong_uses(self, known, twins):
+    def test_wrong_uses(self, known):
         record, _ = wiener_data(known, n=40)
         past, future = record.split(20)
         blank = past.select(outputs=[])
@@ -323,8 +323,6 @@ class TestWiener:
             known.simulate([record])
         with pytest.raises(ValueError, match="modes: expected a model that is one layer"):
             _ = known.modes
-        with pytest.raises(ValueError, match="layers: expected a fitted Cascade"):
-            twins.linear.layers(twins.record)
         stamped = dgp.Record(
             time=future.time,
             inputs=future.inputs,
