@@ -3,214 +3,174 @@
 from __future__ import annotations
 
 import importlib
+import sys
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from pyro_dynogp import plotting
-    from pyro_dynogp.criticism.calibration import Calibration, calibration
-    from pyro_dynogp.criticism.check import Check, check
-    from pyro_dynogp.criticism.comparison import Comparison, Stack, compare, stack
-    from pyro_dynogp.criticism.from_pyro import from_pyro
-    from pyro_dynogp.criticism.loo import loo
-    from pyro_dynogp.criticism.predictive_checks import PredictiveChecks, predictive_checks
-    from pyro_dynogp.criticism.pyro_posterior import PyroPosterior
-    from pyro_dynogp.criticism.rank_results import SimulationBasedCalibration
-    from pyro_dynogp.criticism.simulation_based import simulation_based_calibration
-    from pyro_dynogp.data.record import Record
-    from pyro_dynogp.data.scaling import Scaling
-    from pyro_dynogp.distributions.conditioned import ConditionedLTIProcess
-    from pyro_dynogp.distributions.decay import LogDecayRate
-    from pyro_dynogp.distributions.inducing import InducingLTIProcess, inducing_times
-    from pyro_dynogp.distributions.process import LTIProcess, ObservedLTIProcess
-    from pyro_dynogp.distributions.reparam import InnovationReparam
-    from pyro_dynogp.examples import datasets
-    from pyro_dynogp.gp import LTIKernel, LTIMean, LTIParameters
-    from pyro_dynogp.guides.families import (
-        Family,
-        FullRank,
-        GaussMarkov,
-        InducingTimes,
-        MeanField,
-        Point,
-        SameAsPrior,
-    )
-    from pyro_dynogp.guides.layer_guide import LayerGuide
-    from pyro_dynogp.inference.fit import fit
-    from pyro_dynogp.inference.fitted import Fit
-    from pyro_dynogp.inference.methods.svi import TrainingDivergedError
-    from pyro_dynogp.inference.storage import load
-    from pyro_dynogp.layers.functions import StaticFunction
-    from pyro_dynogp.layers.noise import Gaussian, Heteroscedastic, Likelihood, StudentT
-    from pyro_dynogp.layers.static import sample_static, static_gp
-    from pyro_dynogp.lti.modes import Modes
-    from pyro_dynogp.lti.state import ModalState
-    from pyro_dynogp.models.architectures import (
-        Cascade,
-        Hammerstein,
-        HammersteinWiener,
-        LinearDynamicGP,
-        Wiener,
-        WienerHammerstein,
-    )
-    from pyro_dynogp.models.model import Model
-    from pyro_dynogp.models.output_process import OutputProcess
-    from pyro_dynogp.models.priors import TimeScale, sample_modes
-    from pyro_dynogp.models.system import System
-    from pyro_dynogp.models.wiring import Dynamic, Static
-    from pyro_dynogp.prediction.prediction import Prediction
-    from pyro_dynogp.prediction.scores import scores
+from pyro_dynogp.support.version import __version__ as __version__
 
-__version__ = "0.1.0"
+if TYPE_CHECKING:  # the same names, for editors and type checkers; a test compares the two
+    from pyro_dynogp import effects as effects
+    from pyro_dynogp import guides as guides
+    from pyro_dynogp import plotting as plotting
+    from pyro_dynogp.criticism.calibration import calibration as calibration
+    from pyro_dynogp.criticism.check import check as check
+    from pyro_dynogp.criticism.comparison import compare as compare
+    from pyro_dynogp.criticism.comparison import stack as stack
+    from pyro_dynogp.criticism.from_pyro import from_pyro as from_pyro
+    from pyro_dynogp.criticism.loo import loo as loo
+    from pyro_dynogp.criticism.predictive_checks import predictive_checks as predictive_checks
+    from pyro_dynogp.criticism.simulation_based import (
+        simulation_based_calibration as simulation_based_calibration,
+    )
+    from pyro_dynogp.data.record import Record as Record
+    from pyro_dynogp.data.scaling import Scaling as Scaling
+    from pyro_dynogp.discrepancy.loop import close_loop as close_loop
+    from pyro_dynogp.distributions.process import LTIProcess as LTIProcess
+    from pyro_dynogp.distributions.reparam import InnovationReparam as InnovationReparam
+    from pyro_dynogp.examples import datasets as datasets
+    from pyro_dynogp.gp import LTIKernel as LTIKernel
+    from pyro_dynogp.gp import LTIMean as LTIMean
+    from pyro_dynogp.gp import LTIParameters as LTIParameters
+    from pyro_dynogp.guides.families import FullRank as FullRank
+    from pyro_dynogp.guides.families import GaussMarkov as GaussMarkov
+    from pyro_dynogp.guides.families import InducingTimes as InducingTimes
+    from pyro_dynogp.guides.layer_guide import LayerGuide as LayerGuide
+    from pyro_dynogp.inference.fit import fit as fit
+    from pyro_dynogp.inference.fitted import Fit as Fit
+    from pyro_dynogp.inference.methods.svi import TrainingDivergedError as TrainingDivergedError
+    from pyro_dynogp.inference.storage import load as load
+    from pyro_dynogp.layers.noise import Gaussian as Gaussian
+    from pyro_dynogp.layers.noise import Heteroscedastic as Heteroscedastic
+    from pyro_dynogp.layers.noise import StudentT as StudentT
+    from pyro_dynogp.layers.static import sample_static as sample_static
+    from pyro_dynogp.layers.static import static_gp as static_gp
+    from pyro_dynogp.lti.modes import Modes as Modes
+    from pyro_dynogp.models.architectures import Cascade as Cascade
+    from pyro_dynogp.models.architectures import Hammerstein as Hammerstein
+    from pyro_dynogp.models.architectures import HammersteinWiener as HammersteinWiener
+    from pyro_dynogp.models.architectures import LinearDynamicGP as LinearDynamicGP
+    from pyro_dynogp.models.architectures import Wiener as Wiener
+    from pyro_dynogp.models.architectures import WienerHammerstein as WienerHammerstein
+    from pyro_dynogp.models.model import Model as Model
+    from pyro_dynogp.models.priors import TimeScale as TimeScale
+    from pyro_dynogp.models.priors import sample_modes as sample_modes
+    from pyro_dynogp.models.wiring import Dynamic as Dynamic
+    from pyro_dynogp.models.wiring import Static as Static
+    from pyro_dynogp.prediction.prediction import Prediction as Prediction
+    from pyro_dynogp.prediction.scores import scores as scores
 
-# Names are imported when they are first used (PEP 562), so that the command line answers at once.
-_HOME = {
-    "Calibration": "pyro_dynogp.criticism.calibration",
-    "Cascade": "pyro_dynogp.models.architectures",
-    "System": "pyro_dynogp.models.system",
-    "Check": "pyro_dynogp.criticism.check",
-    "Comparison": "pyro_dynogp.criticism.comparison",
-    "ConditionedLTIProcess": "pyro_dynogp.distributions.conditioned",
-    "Dynamic": "pyro_dynogp.models.wiring",
-    "Family": "pyro_dynogp.guides.families",
-    "Fit": "pyro_dynogp.inference.fitted",
-    "FullRank": "pyro_dynogp.guides.families",
-    "GaussMarkov": "pyro_dynogp.guides.families",
-    "Gaussian": "pyro_dynogp.layers.noise",
-    "Hammerstein": "pyro_dynogp.models.architectures",
-    "HammersteinWiener": "pyro_dynogp.models.architectures",
-    "Heteroscedastic": "pyro_dynogp.layers.noise",
-    "InducingLTIProcess": "pyro_dynogp.distributions.inducing",
-    "InducingTimes": "pyro_dynogp.guides.families",
-    "InnovationReparam": "pyro_dynogp.distributions.reparam",
-    "LTIKernel": "pyro_dynogp.gp",
-    "LTIMean": "pyro_dynogp.gp",
-    "LTIParameters": "pyro_dynogp.gp",
-    "LTIProcess": "pyro_dynogp.distributions.process",
-    "LayerGuide": "pyro_dynogp.guides.layer_guide",
-    "Likelihood": "pyro_dynogp.layers.noise",
-    "LinearDynamicGP": "pyro_dynogp.models.architectures",
-    "Model": "pyro_dynogp.models.model",
-    "LogDecayRate": "pyro_dynogp.distributions.decay",
-    "MeanField": "pyro_dynogp.guides.families",
-    "ModalState": "pyro_dynogp.lti.state",
-    "Modes": "pyro_dynogp.lti.modes",
-    "OutputProcess": "pyro_dynogp.models.output_process",
-    "ObservedLTIProcess": "pyro_dynogp.distributions.process",
-    "Point": "pyro_dynogp.guides.families",
-    "Prediction": "pyro_dynogp.prediction.prediction",
-    "PredictiveChecks": "pyro_dynogp.criticism.predictive_checks",
-    "PyroPosterior": "pyro_dynogp.criticism.pyro_posterior",
-    "Record": "pyro_dynogp.data.record",
-    "SameAsPrior": "pyro_dynogp.guides.families",
-    "Scaling": "pyro_dynogp.data.scaling",
-    "SimulationBasedCalibration": "pyro_dynogp.criticism.rank_results",
-    "Stack": "pyro_dynogp.criticism.comparison",
-    "Static": "pyro_dynogp.models.wiring",
-    "StaticFunction": "pyro_dynogp.layers.functions",
-    "StudentT": "pyro_dynogp.layers.noise",
-    "TimeScale": "pyro_dynogp.models.priors",
-    "TrainingDivergedError": "pyro_dynogp.inference.methods.svi",
-    "Wiener": "pyro_dynogp.models.architectures",
-    "WienerHammerstein": "pyro_dynogp.models.architectures",
-    "calibration": "pyro_dynogp.criticism.calibration",
-    "check": "pyro_dynogp.criticism.check",
-    "close_loop": "pyro_dynogp.discrepancy.loop",
-    "compare": "pyro_dynogp.criticism.comparison",
-    "fit": "pyro_dynogp.inference.fit",
-    "from_pyro": "pyro_dynogp.criticism.from_pyro",
-    "inducing_times": "pyro_dynogp.distributions.inducing",
-    "load": "pyro_dynogp.inference.storage",
-    "loo": "pyro_dynogp.criticism.loo",
-    "predictive_checks": "pyro_dynogp.criticism.predictive_checks",
-    "sample_modes": "pyro_dynogp.models.priors",
-    "sample_static": "pyro_dynogp.layers.static",
-    "scores": "pyro_dynogp.prediction.scores",
-    "simulation_based_calibration": "pyro_dynogp.criticism.simulation_based",
-    "stack": "pyro_dynogp.criticism.comparison",
-    "static_gp": "pyro_dynogp.layers.static",
+# Where each public name is defined. They are imported when they are first used (PEP 562), so that
+# the command line answers at once.
+HOMES = {
+    # A record and a fit of it.
+    "Record": "data.record",
+    "fit": "inference.fit",
+    "load": "inference.storage",
+    "Fit": "inference.fitted",
+    "Prediction": "prediction.prediction",
+    "Scaling": "data.scaling",
+    "TrainingDivergedError": "inference.methods.svi",
+    "scores": "prediction.scores",
+    # Models, and what they are made of.
+    "LinearDynamicGP": "models.architectures",
+    "Wiener": "models.architectures",
+    "Hammerstein": "models.architectures",
+    "WienerHammerstein": "models.architectures",
+    "HammersteinWiener": "models.architectures",
+    "Cascade": "models.architectures",
+    "Model": "models.model",
+    "Dynamic": "models.wiring",
+    "Static": "models.wiring",
+    "Gaussian": "layers.noise",
+    "StudentT": "layers.noise",
+    "Heteroscedastic": "layers.noise",
+    "TimeScale": "models.priors",
+    # Criticism of a fit, and the loop that extends its model.
+    "loo": "criticism.loo",
+    "compare": "criticism.comparison",
+    "stack": "criticism.comparison",
+    "check": "criticism.check",
+    "calibration": "criticism.calibration",
+    "predictive_checks": "criticism.predictive_checks",
+    "simulation_based_calibration": "criticism.simulation_based",
+    "from_pyro": "criticism.from_pyro",
+    "close_loop": "discrepancy.loop",
+    # Parts of a Pyro model of one's own.
+    "LTIProcess": "distributions.process",
+    "Modes": "lti.modes",
+    "InnovationReparam": "distributions.reparam",
+    "sample_modes": "models.priors",
+    "sample_static": "layers.static",
+    "static_gp": "layers.static",
+    "LayerGuide": "guides.layer_guide",
+    "FullRank": "guides.families",
+    "GaussMarkov": "guides.families",
+    "InducingTimes": "guides.families",
+    "LTIKernel": "gp",
+    "LTIMean": "gp",
+    "LTIParameters": "gp",
 }
-_MODULES = {"datasets": "pyro_dynogp.examples.datasets", "plotting": "pyro_dynogp.plotting"}
+# Public modules.
+MODULES = {
+    "datasets": "examples.datasets",
+    "effects": "effects",
+    "guides": "guides",
+    "plotting": "plotting",
+}
+# Names that were here before, and where they are now.
+MOVED = {
+    "Calibration": "criticism.calibration.Calibration",
+    "CascadeSystem": "models.system.System",
+    "Check": "criticism.check.Check",
+    "Comparison": "criticism.comparison.Comparison",
+    "ConditionedLTIProcess": "distributions.process.ConditionedLTIProcess",
+    "Family": "guides.families.Family",
+    "InducingLTIProcess": "distributions.inducing.InducingLTIProcess",
+    "Likelihood": "layers.noise.Likelihood",
+    "LogDecayRate": "distributions.decay.LogDecayRate",
+    "MeanField": "guides.families.MeanField",
+    "ModalState": "lti.state.ModalState",
+    "ObservedCascade": "models.output_process.OutputProcess",
+    "ObservedLTIProcess": "distributions.process.ObservedLTIProcess",
+    "Point": "guides.families.Point",
+    "PredictiveChecks": "criticism.predictive_checks.PredictiveChecks",
+    "PyroPosterior": "criticism.pyro_posterior.PyroPosterior",
+    "SameAsPrior": "guides.families.SameAsPrior",
+    "SimulationBasedCalibration": "criticism.rank_results.SimulationBasedCalibration",
+    "Stack": "criticism.comparison.Stack",
+    "StaticFunction": "layers.functions.StaticFunction",
+    "inducing_times": "distributions.inducing.inducing_times",
+}
 
-__all__ = [
-    "Calibration",
-    "Cascade",
-    "Check",
-    "Comparison",
-    "ConditionedLTIProcess",
-    "Dynamic",
-    "Family",
-    "Fit",
-    "FullRank",
-    "GaussMarkov",
-    "Gaussian",
-    "Hammerstein",
-    "HammersteinWiener",
-    "Heteroscedastic",
-    "InducingLTIProcess",
-    "InducingTimes",
-    "InnovationReparam",
-    "LTIKernel",
-    "LTIMean",
-    "LTIParameters",
-    "LTIProcess",
-    "LayerGuide",
-    "Likelihood",
-    "LinearDynamicGP",
-    "LogDecayRate",
-    "MeanField",
-    "ModalState",
-    "Model",
-    "Modes",
-    "ObservedLTIProcess",
-    "OutputProcess",
-    "Point",
-    "Prediction",
-    "PredictiveChecks",
-    "PyroPosterior",
-    "Record",
-    "SameAsPrior",
-    "Scaling",
-    "SimulationBasedCalibration",
-    "Stack",
-    "Static",
-    "StaticFunction",
-    "StudentT",
-    "System",
-    "TimeScale",
-    "TrainingDivergedError",
-    "Wiener",
-    "WienerHammerstein",
-    "calibration",
-    "check",
-    "close_loop",
-    "compare",
-    "datasets",
-    "fit",
-    "from_pyro",
-    "inducing_times",
-    "load",
-    "loo",
-    "plotting",
-    "predictive_checks",
-    "sample_modes",
-    "sample_static",
-    "scores",
-    "simulation_based_calibration",
-    "stack",
-    "static_gp",
-]
+__all__ = sorted([*HOMES, *MODULES])
 
 
 def __getattr__(name: str) -> Any:
-    if name in _MODULES:
-        value: Any = importlib.import_module(_MODULES[name])
-    elif name in _HOME:
-        value = getattr(importlib.import_module(_HOME[name]), name)
+    if name in MODULES:
+        value: Any = importlib.import_module(f"{__name__}.{MODULES[name]}")
+    elif name in HOMES:
+        value = getattr(importlib.import_module(f"{__name__}.{HOMES[name]}"), name)
+    elif name in MOVED:
+        raise AttributeError(
+            f"module {__name__!r} has no attribute {name!r}: it is now {__name__}.{MOVED[name]}"
+        )
     else:
-        raise AttributeError(f"module 'pyro_dynogp' has no attribute {name!r}")
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     globals()[name] = value
     return value
 
 
 def __dir__() -> list[str]:
     return sorted([*__all__, "__version__"])
+
+
+class _Package(ModuleType):
+    """The import system binds a submodule to its package: here a function of that name stays."""
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if not (name in HOMES and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

@@ -11,7 +11,8 @@ from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.left_out import Found, forecast, missing_sample, new_record
 from pyro_dynogp.criticism.posterior_draws import DRAWS
 from pyro_dynogp.criticism.subjects import FitSubject, Parameters, Subject
-from pyro_dynogp.data.record import Record, as_records
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.records import as_records
 from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import hashlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -206,3 +207,13 @@ def read_clock(time: Any, start: Any, time_unit: str) -> tuple[Array, pd.Timesta
             "experiments as several records.",
         )
     return clock, origin
+
+
+def fingerprint_of(text: str, arrays: Sequence[Array]) -> str:
+    """Hex SHA-256 of a text and arrays: equal for equal values."""
+    digest = hashlib.sha256(text.encode())
+    for array in arrays:
+        # One bit pattern for each value: -0.0 + 0.0 is 0.0, and NaN has many patterns.
+        plain = np.where(np.isnan(array), np.nan, array + 0.0).astype("<f8")
+        digest.update(repr(plain.shape).encode() + plain.tobytes())
+    return digest.hexdigest()

@@ -1,40 +1,54 @@
-"""Readers: a Record from a DataFrame, from a text file of columns, from an xarray Dataset."""
+"""Readers: the arguments of a Record from a DataFrame, a text file of columns, a Dataset."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from numbers import Real
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypedDict, Unpack
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
 from pyro_dynogp.data.checks import Array, Names
-from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.fields import RecordFields
 from pyro_dynogp.data.text_table import localise, named_column, no_number, read_table
 from pyro_dynogp.support.errors import invalid
 
 
-def from_frame(
+class ColumnOptions(TypedDict, total=False):
+    """Options of every reader; `read_frame` says what they mean."""
+
+    output: Names
+    time: str | None
+    sampling_time: float | None
+    timezone: str | None
+    time_unit: str | None
+    extra: Literal["all"] | Sequence[str] | None
+    input_units: Names
+    output_units: Names
+    extra_units: Mapping[str, str] | None
+    name: str | None
+
+
+class TextOptions(ColumnOptions, total=False):
+    """Options of `read_csv`."""
+
+    header: bool | None
+    names: Sequence[str] | None
+    delimiter: str | None
+    decimal: str | None
+    encoding: str
+
+
+def read_frame(
     frame: pd.DataFrame,
     inputs: Names = (),
     outputs: Names = None,
-    *,
-    output: Names = None,
-    time: str | None = None,
-    sampling_time: float | None = None,
-    timezone: str | None = None,
-    time_unit: str | None = None,
-    extra: Literal["all"] | Sequence[str] | None = "all",
-    input_units: Names = None,
-    output_units: Names = None,
-    extra_units: Mapping[str, str] | None = None,
-    name: str | None = None,
-) -> Record:
+    **options: Unpack[ColumnOptions],
+) -> RecordFields:
     """Record from the columns of a DataFrame.
 
     Args:
@@ -55,17 +69,19 @@ def from_frame(
         name: label; by default that in `frame.attrs`, or "".
 
     Returns:
-        The record.
+        The arguments of `Record`.
 
     Raises:
         ValueError: unknown columns, cells that are no numbers, no times or two sources of them,
             stamps without a zone, local times that daylight saving makes ambiguous.
     """
+    _check_options(options, ColumnOptions)
     columns = {str(key): frame[key] for key in frame.columns}
     if len(columns) != frame.shape[1]:
         raise invalid("frame", expected="unique column names", got=f"{list(map(str, frame))}")
     stamped = isinstance(frame.index, pd.DatetimeIndex)
     timed_index = stamped or pd.api.types.is_float_dtype(frame.index.dtype)
+    time = options.get("time")
     if time is None and timed_index:
         time = "index"
     if time == "index" and time not in columns:
@@ -74,42 +90,45 @@ def from_frame(
         source = None if time is None else named_column(columns, "time", time)
     origin = None
     if source is not None and pd.api.types.is_datetime64_any_dtype(source.dtype):
-        source = localise(pd.DatetimeIndex(source), timezone)
+        source = localise(pd.DatetimeIndex(source), options.get("timezone"))
         begin = frame.attrs.get("start")
         origin = None if begin is None else pd.Timestamp(begin).tz_convert(source.tz)
-    clock = _clock(source, sampling_time, len(frame))
-    chosen = _choose(columns, inputs, outputs, output, extra, time)
+    clock = _clock(source, options.get("sampling_time"), len(frame))
+    chosen = _choose(columns, inputs, outputs, options, time)
     values = {key: _series_numbers(key, columns[key]) for keys in chosen for key in keys}
     units = {str(k): str(v) for k, v in frame.attrs.get("units", {}).items()}
-    return _build(
-        clock, values, chosen, units, input_units, output_units, extra_units,
-        time_unit=time_unit or frame.attrs.get("time_unit", "s"),
-        name=frame.attrs.get("name", "") if name is None else name, start=origin,
+    label = options.get("name")
+    return _fields(
+        clock, values, chosen, units, options,
+        time_unit=options.get("time_unit") or frame.attrs.get("time_unit", "s"),
+        name=frame.attrs.get("name", "") if label is None else label, start=origin,
     )  # fmt: skip
 
 
-def from_xarray(
-    dataset: xr.Dataset, inputs: Names = (), outputs: Names = None, *, time: str = "time",
-    output: Names = None, extra: Literal["all"] | Sequence[str] | None = "all", **options: Any,
-) -> Record:  # fmt: skip
+def read_xarray(
+    dataset: xr.Dataset,
+    inputs: Names = (),
+    outputs: Names = None,
+    **options: Unpack[ColumnOptions],
+) -> RecordFields:
     """Record from the variables of a Dataset that run over the dimension of time alone.
 
     Args:
         dataset: the data; units are read from `attrs["units"]` of the variables and of time.
         inputs: names of the input variables.
         outputs: names of the output variables; NaN is a missing sample.
-        time: name of the dimension and coordinate of time: numbers (with the attribute "start"
-            the instant of zero), or datetime64 together with `timezone`.
-        output: the same as `outputs`; give one of the two.
-        extra: "all" keeps every other such variable, a list keeps those, None none.
-        **options: as in `from_frame`.
+        **options: as in `read_frame`, but for `time`: name of the dimension and coordinate of
+            time, "time" by default: numbers (with the attribute "start" the instant of zero), or
+            datetime64 together with `timezone`.
 
     Returns:
-        The record.
+        The arguments of `Record`.
 
     Raises:
-        ValueError: no such time coordinate, unknown variables, and as in `from_frame`.
+        ValueError: no such time coordinate, unknown variables, and as in `read_frame`.
     """
+    _check_options(options, ColumnOptions)
+    time = options.get("time") or "time"
     if time not in dataset.coords or dataset[time].dims != (time,):
         raise invalid(
             "time", expected=f"a coordinate of a dimension of that name {list(dataset.coords)}",
@@ -124,34 +143,20 @@ def from_xarray(
     frame.attrs = {"units": units, "name": str(dataset.attrs.get("name", ""))}
     if "units" in clock.attrs:
         frame.attrs["time_unit"] = clock.attrs["units"]
-    record = from_frame(frame, inputs, outputs, output=output, time="index", extra=extra, **options)
-    if "start" not in clock.attrs or record.start is not None:
-        return record
-    start = pd.Timestamp(clock.attrs["start"]).tz_convert(clock.attrs.get("time_zone"))
-    return dataclasses.replace(record, start=start)
+    options["time"] = "index"
+    fields = read_frame(frame, inputs, outputs, **options)
+    if "start" in clock.attrs and fields["start"] is None:
+        start = pd.Timestamp(clock.attrs["start"]).tz_convert(clock.attrs.get("time_zone"))
+        fields["start"] = start
+    return fields
 
 
-def from_csv(
+def read_csv(
     path: str | PathLike[str],
     inputs: Names = (),
     outputs: Names = None,
-    *,
-    output: Names = None,
-    time: str | None = None,
-    sampling_time: float | None = None,
-    timezone: str | None = None,
-    time_unit: str = "s",
-    extra: Literal["all"] | Sequence[str] | None = "all",
-    input_units: Names = None,
-    output_units: Names = None,
-    extra_units: Mapping[str, str] | None = None,
-    name: str | None = None,
-    header: bool | None = None,
-    names: Sequence[str] | None = None,
-    delimiter: str | None = None,
-    decimal: str | None = None,
-    encoding: str = "utf-8-sig",
-) -> Record:
+    **options: Unpack[TextOptions],
+) -> RecordFields:
     """Record from a text file of columns; local files, also .gz, .bz2 and .xz.
 
     Names of columns: those of the first line. A line that holds only numbers, time stamps and
@@ -187,22 +192,35 @@ def from_csv(
         encoding: of the file.
 
     Returns:
-        The record.
+        The arguments of `Record`.
 
     Raises:
         ValueError: unknown columns; cells that are no numbers (their line and column); lines of
             too many cells; no times or two sources of them; stamps without a zone, or that
             daylight saving makes ambiguous.
     """
-    table = read_table(Path(path), header, names, delimiter, decimal, encoding)
-    source = None if time is None else table.times(time, timezone)
-    chosen = _choose(table.columns, inputs, outputs, output, extra, time)
-    return _build(
-        _clock(source, sampling_time, len(table.lines)),
+    _check_options(options, TextOptions)
+    table = read_table(
+        Path(path), options.get("header"), options.get("names"), options.get("delimiter"),
+        options.get("decimal"), options.get("encoding", "utf-8-sig"),
+    )  # fmt: skip
+    time, name = options.get("time"), options.get("name")
+    source = None if time is None else table.times(time, options.get("timezone"))
+    chosen = _choose(table.columns, inputs, outputs, options, time)
+    return _fields(
+        _clock(source, options.get("sampling_time"), len(table.lines)),
         {key: table.numbers(key) for keys in chosen for key in keys},
-        chosen, {}, input_units, output_units, extra_units, time_unit=time_unit,
+        chosen, {}, options, time_unit=options.get("time_unit") or "s",
         name=Path(path).name.split(".")[0] if name is None else name, start=None,
     )  # fmt: skip
+
+
+def _check_options(options: Mapping[str, object], known: type) -> None:
+    for option in options:
+        if option not in known.__annotations__:
+            raise TypeError(
+                f"{option!r} is no option of this reader, which knows {list(known.__annotations__)}"
+            )
 
 
 def _series_numbers(key: str, series: pd.Series) -> Array:
@@ -220,10 +238,11 @@ def _series_numbers(key: str, series: pd.Series) -> Array:
 
 
 def _choose(
-    columns: Mapping[str, Any], inputs: Names, outputs: Names, output: Names,
-    extra: str | Sequence[str] | None, time: str | None,
+    columns: Mapping[str, Any], inputs: Names, outputs: Names, options: ColumnOptions,
+    time: str | None,
 ) -> tuple[list[str], list[str], list[str]]:  # fmt: skip
     """Names of the inputs, outputs and extra channels, all of them known."""
+    output, extra = options.get("output"), options.get("extra", "all")
     if outputs is not None and output is not None:
         raise invalid("output", expected="either output or outputs", got="both")
     chosen = []
@@ -265,22 +284,26 @@ def _clock(source: Any, sampling_time: float | None, n: int) -> Any:
     return np.arange(n) * float(step)
 
 
-def _build(
+def _fields(
     clock: Any, values: Mapping[str, Array], chosen: tuple[list[str], list[str], list[str]],
-    units: Mapping[str, str], input_units: Names, output_units: Names,
-    extra_units: Mapping[str, str] | None, **fields: Any,
-) -> Record:  # fmt: skip
+    units: Mapping[str, str], options: ColumnOptions, *, time_unit: str, name: str,
+    start: pd.Timestamp | None,
+) -> RecordFields:  # fmt: skip
     u, y, rest = chosen
     empty = np.empty((len(clock), 0))
-    return Record(
-        clock,
-        np.column_stack([empty, *(values[key] for key in u)]),
-        np.column_stack([empty, *(values[key] for key in y)]),
-        input_names=u,
-        output_names=y,
-        input_units=[units.get(key, "") for key in u] if input_units is None else input_units,
-        output_units=[units.get(key, "") for key in y] if output_units is None else output_units,
-        extra={key: values[key] for key in rest},
-        extra_units={key: units.get(key, "") for key in rest} | dict(extra_units or {}),
-        **fields,
-    )
+    u_units, y_units = options.get("input_units"), options.get("output_units")
+    extra_units = options.get("extra_units") or {}
+    return {
+        "time": clock,
+        "inputs": np.column_stack([empty, *(values[key] for key in u)]),
+        "outputs": np.column_stack([empty, *(values[key] for key in y)]),
+        "input_names": u,
+        "output_names": y,
+        "input_units": [units.get(key, "") for key in u] if u_units is None else u_units,
+        "output_units": [units.get(key, "") for key in y] if y_units is None else y_units,
+        "extra": {key: values[key] for key in rest},
+        "extra_units": {key: units.get(key, "") for key in rest} | dict(extra_units),
+        "time_unit": time_unit,
+        "name": name,
+        "start": start,
+    }

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from pyro_dynogp.data.checks import Array
-from pyro_dynogp.data.record import Record, as_records
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.records import as_records
 from pyro_dynogp.support.errors import invalid
 
 _ARRAYS = ("input_offset", "input_scale", "output_offset", "output_scale")

@@ -1,63 +1,99 @@
-"""Writers: a Record as a DataFrame, as an xarray Dataset, as a table to read."""
+"""Channels as tensors, as a DataFrame, as an xarray Dataset, as a table to read."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import xarray as xr
+from torch import Tensor
 
 from pyro_dynogp.data.checks import Array
-
-if TYPE_CHECKING:
-    from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.clock import stamps_of
 
 
-def columns_of(record: Record) -> tuple[dict[str, Array], dict[str, str]]:
-    """All channels by name, inputs, outputs and extra ones in this order, and their units."""
-    values = {name: record.inputs[:, i] for i, name in enumerate(record.input_names)}
-    values |= {name: record.outputs[:, i] for i, name in enumerate(record.output_names)}
-    units = dict(zip(record.input_names, record.input_units, strict=True))
-    units |= dict(zip(record.output_names, record.output_units, strict=True))
-    return values | dict(record.extra), units | dict(record.extra_units)
+@dataclass(frozen=True)
+class RecordTensors:
+    """The numbers of a record as torch.float64 tensors, for writing Pyro models.
+
+    Attributes:
+        time: time of each sample, shape (n,) [time unit of the record].
+        inputs: u, shape (n, n_u) [input units].
+        outputs: y, shape (n, n_y) [output units]; NaN marks a missing sample.
+    """
+
+    time: Tensor
+    inputs: Tensor
+    outputs: Tensor
+
+    @property
+    def observations(self) -> Tensor:
+        """Outputs as models observe them: (n,) of one output, (n, n_y) of several [output units].
+
+        NaN marks a missing sample.
+        """
+        return self.outputs if self.outputs.shape[1] != 1 else self.outputs[:, 0]
 
 
-def to_frame(record: Record) -> pd.DataFrame:
+@dataclass(frozen=True)
+class Channels:
+    """All channels of a record by name, on its clock: inputs, outputs, extra ones in this order.
+
+    Attributes:
+        values: name -> (n,). units: name -> unit.
+        time: (n,) [time_unit]; seconds since `start` where there is one.
+    """
+
+    values: Mapping[str, Array]
+    units: Mapping[str, str]
+    time: Array
+    time_unit: str
+    start: pd.Timestamp | None
+    name: str
+
+
+def to_frame(channels: Channels) -> pd.DataFrame:
     """Channels as columns; see `Record.to_frame`."""
-    values, units = columns_of(record)
-    index = record.timestamps if record.start is not None else pd.Index(record.time)
-    frame = pd.DataFrame(values, index=index).rename_axis("time")
-    frame.attrs = {"units": units, "time_unit": record.time_unit, "name": record.name}
-    if record.start is not None:
-        frame.attrs["start"] = record.start.isoformat()
+    time, start = channels.time, channels.start
+    index = pd.Index(time) if start is None else stamps_of(time, start)
+    frame = pd.DataFrame(dict(channels.values), index=index).rename_axis("time")
+    frame.attrs = {
+        "units": dict(channels.units), "time_unit": channels.time_unit, "name": channels.name
+    }  # fmt: skip
+    if start is not None:
+        frame.attrs["start"] = start.isoformat()
     return frame
 
 
-def to_xarray(record: Record) -> xr.Dataset:
+def to_xarray(channels: Channels) -> xr.Dataset:
     """Channels as variables over "time"; see `Record.to_xarray`."""
-    values, units = columns_of(record)
-    clock = {"units": record.time_unit}
-    coords: dict[str, Any] = {"time": ("time", record.time, clock)}
-    if record.timestamps is not None and record.start is not None:
-        clock |= {"start": record.start.isoformat(), "time_zone": str(record.start.tz)}
-        utc = record.timestamps.tz_convert("UTC").tz_localize(None)
+    clock = {"units": channels.time_unit}
+    coords: dict[str, Any] = {"time": ("time", channels.time, clock)}
+    if channels.start is not None:
+        clock |= {"start": channels.start.isoformat(), "time_zone": str(channels.start.tz)}
+        utc = stamps_of(channels.time, channels.start).tz_convert("UTC").tz_localize(None)
         coords["timestamp"] = ("time", utc.to_numpy())
-    channels = {k: ("time", v, {"units": units[k]}) for k, v in values.items()}
-    return xr.Dataset(channels, coords, {"name": record.name})
+    variables = {
+        name: ("time", column, {"units": channels.units[name]})
+        for name, column in channels.values.items()
+    }
+    return xr.Dataset(variables, coords, {"name": channels.name})
 
 
-def summary(record: Record) -> str:
-    """Table of the channels; see `Record.summary`."""
-    values, units = columns_of(record)
-    lines = [repr(record), f"{'channel':<20}{'role':<8}{'unit':<10}"]
+def summary(
+    title: str, channels: Channels, inputs: Collection[str], outputs: Collection[str]
+) -> str:
+    """Table of the channels under a title; see `Record.summary`."""
+    lines = [title, f"{'channel':<20}{'role':<8}{'unit':<10}"]
     lines[1] += "".join(f"{head:>12}" for head in ("min", "mean", "max", "missing"))
-    for name, column in values.items():
+    for name, column in channels.values.items():
         seen = column[~np.isnan(column)]
-        role = "input" if name in record.input_names else "extra"
-        role = "output" if name in record.output_names else role
+        role = "output" if name in outputs else "input" if name in inputs else "extra"
         numbers = (seen.min(), seen.mean(), seen.max()) if len(seen) else (np.nan,) * 3
         cells = "".join(f"{number:>12.5g}" for number in numbers)
         gaps = len(column) - len(seen)
-        lines.append(f"{name:<20}{role:<8}{units[name] or '-':<10}{cells}{gaps:>12}")
+        lines.append(f"{name:<20}{role:<8}{channels.units[name] or '-':<10}{cells}{gaps:>12}")
     return "\n".join(lines)

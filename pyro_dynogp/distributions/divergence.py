@@ -21,8 +21,7 @@ import torch
 from torch import Tensor
 from torch.distributions import register_kl
 
-from pyro_dynogp.distributions.conditioned import ConditionedLTIProcess
-from pyro_dynogp.distributions.process import LTIProcess
+from pyro_dynogp.distributions.process import ConditionedLTIProcess, LTIProcess
 from pyro_dynogp.distributions.trajectory import apply
 from pyro_dynogp.support.tensors import broadcast
 

@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from pyro.distributions import constraints
 from torch import Tensor
 from torch.distributions import MultivariateNormal, register_kl
 
@@ -79,11 +78,6 @@ class InducingLTIProcess(Trajectory):
         self._inner: SemiseparableCovariance | None = None
         batch = broadcast(prior.batch_shape, self.loc.shape[:-1], self.scale_tril.shape[:-2])
         self._shape(batch, len(prior.grid), validate_args)
-
-    @property
-    def support(self) -> constraints.Constraint:
-        """Real trajectories."""
-        return constraints.independent(constraints.real, len(self.event_shape))
 
     @property
     def K_zz(self) -> SemiseparableCovariance:

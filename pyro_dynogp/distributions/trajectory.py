@@ -48,6 +48,11 @@ class Trajectory(TorchDistribution):
         super().__init__(batch, torch.Size(event), validate_args=validate_args)
 
     @property
+    def support(self) -> constraints.Constraint:
+        """Real trajectories."""
+        return constraints.independent(constraints.real, len(self.event_shape))
+
+    @property
     def mean(self) -> Tensor:
         """(*batch, *event)."""
         raise NotImplementedError
@@ -151,3 +156,28 @@ def split_missing(residual: Tensor) -> tuple[Tensor, Tensor | None]:
     residual = residual.masked_fill(missing, 0.0)
     flat = missing.reshape(-1, missing.shape[-1])
     return residual, flat[0] if bool((flat == flat[0]).all()) else missing
+
+
+def noise_of_samples(sd: Tensor, event: torch.Size, varying: bool) -> tuple[Tensor, torch.Size]:
+    """Variance (*b, *event) of the noise of each sample, and its batch shape b.
+
+    Args:
+        sd: standard deviation [output] (*b), or (*b, n_y) of several outputs; with `varying`
+            (*b, *event).
+
+    Raises:
+        ValueError: where its shape is another one.
+    """
+    if varying:
+        tail = tuple(event)
+    else:
+        tail = tuple(event[1:])
+        if tail and sd.dim() == 0:
+            sd = sd.expand(tail)
+    if sd.shape[sd.dim() - len(tail) :] != torch.Size(tail):
+        raise invalid("noise_sd", expected=f"shape (..., {tail})", got=f"shape {tuple(sd.shape)}")
+    batch = sd.shape[: sd.dim() - len(tail)]
+    v = sd.square()
+    if not varying:
+        v = v.unsqueeze(-1 - len(tail)).expand((*batch, *event))
+    return v, batch

@@ -25,6 +25,22 @@ class ModalState:
     mean: Tensor
     covariance: Tensor | None = None
 
+    def check(self, pairs: int) -> None:
+        """Refuse a state that is not one of a system with P = `pairs` modes.
+
+        Raises:
+            ValueError: where the shape of the mean or of the covariance does not fit.
+        """
+        P, size = self.covariance, (2 * pairs,) * 2
+        if self.mean.shape[-1:] != (pairs,) or (P is not None and P.shape[-2:] != size):
+            covariance = "None" if P is None else f"shape {tuple(P.shape)}"
+            raise invalid(
+                "initial_state",
+                expected=f"mean (..., {pairs}) and covariance (..., {2 * pairs}, {2 * pairs}) "
+                "or None",
+                got=f"mean of shape {tuple(self.mean.shape)}, covariance {covariance}",
+            )
+
 
 def real_propagator(phi: Tensor) -> Tensor:
     """The real matrix (*b, 2P, 2P) that multiplies [Re x; Im x] where phi (*b, P) multiplies x."""

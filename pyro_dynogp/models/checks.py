@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from pyro_dynogp.data.channels import Channel, count_direct, prepared
-from pyro_dynogp.data.record import Record, as_records
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.records import as_records
 from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:

@@ -17,7 +17,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pyro_dynogp.distributions.conditioned import ConditionedLTIProcess
 from pyro_dynogp.distributions.pointwise import (
     Moments,
     ahead,
@@ -25,7 +24,7 @@ from pyro_dynogp.distributions.pointwise import (
     one_step,
     prediction_errors,
 )
-from pyro_dynogp.distributions.process import LTIProcess, ObservedLTIProcess
+from pyro_dynogp.distributions.process import ConditionedLTIProcess, LTIProcess, ObservedLTIProcess
 from pyro_dynogp.lti.state import ModalState, propagate
 from pyro_dynogp.models.draws import JointState
 from pyro_dynogp.models.output_process import Components, LayerMoments, OutputProcess

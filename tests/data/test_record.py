@@ -13,7 +13,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pyro_dynogp.data.record import Record, as_records
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.records import as_records
 
 
 def example(n=6, **changes):

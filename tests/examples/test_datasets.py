@@ -7,7 +7,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pyro_dynogp.data.record import Record, as_records
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.records import as_records
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.examples import datasets
 

@@ -88,7 +88,7 @@ def test_one_dynamic_layer_is_the_linear_model(record):
 
 class TestGuides:
     def test_a_mapping_chooses_the_family_of_a_site(self, bent):
-        guide = {"g": dgp.InducingTimes(20), "f_values": dgp.MeanField()}
+        guide = {"g": dgp.InducingTimes(20), "f_values": dgp.guides.MeanField()}
         fit = dgp.fit(wiener(), bent[:60], guide=guide, **FAST)
         assert usable(fit, bent[:60])
         assert set(fit.trajectories) == {"g", "f"}

@@ -11,6 +11,7 @@ from scipy import stats
 from scipy.stats import kurtosis
 
 import pyro_dynogp as dgp
+from pyro_dynogp.distributions.process import ConditionedLTIProcess
 from pyro_dynogp.models.system import scaled_inputs
 from pyro_dynogp.prediction.first_state import estimate
 from tests.models.outputs import by_moments, physical_of, prior_process
@@ -97,7 +98,7 @@ class TestOneDynamicLayer:
         process = prior_process(twins.linear, twins.record)
         y = torch.tensor(twins.record.outputs[:, 0])
         observed = process.observed(physical_of(twins.linear).noise_sd)
-        exact = dgp.ConditionedLTIProcess(observed, y.expand(2, -1))
+        exact = ConditionedLTIProcess(observed, y.expand(2, -1))
         # The layer has neither the output's unit nor its offset.
         scale = twins.linear.scaling.output_scale[0]
         offset = physical_of(twins.linear).offset.unsqueeze(-1)

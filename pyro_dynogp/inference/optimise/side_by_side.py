@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pyro_dynogp.data.record import Record, as_records
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.records import as_records
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.optimise.lockstep import Functions, in_lockstep

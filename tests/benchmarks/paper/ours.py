@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 import pyro_dynogp as dgp
+from pyro_dynogp.criticism.comparison import Stack
 from pyro_dynogp.inference.density import Potential
 from tests.benchmarks.paper.prediction import OURS, Outcome, Predicted, Task
 
@@ -99,7 +100,7 @@ def _fitted(model: dgp.Cascade | dgp.LinearDynamicGP, task: Task) -> Outcome:
     )
 
 
-def _predictions(fit: dgp.Fit | dgp.Stack, task: Task) -> Sequence[Predicted]:
+def _predictions(fit: dgp.Fit | Stack, task: Task) -> Sequence[Predicted]:
     """Free runs: from the filtered state where the test follows, else from an unknown one."""
     found = []
     for test in test_records(task):
