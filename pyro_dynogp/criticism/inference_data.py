@@ -13,7 +13,6 @@ import torch
 import xarray as xr
 from torch import Tensor
 
-import pyro_dynogp
 from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.labelled import Coordinate, Variable, clock_of, dataset_of, units_of
 from pyro_dynogp.criticism.physical import physical_quantities
@@ -32,6 +31,7 @@ from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.prediction.first_state import beginning
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.parallel import seeded
+from pyro_dynogp.support.version import __version__
 
 if TYPE_CHECKING:
     from pyro_dynogp.inference.fitted import Fit
@@ -107,7 +107,7 @@ class _Export:
         fit = self.fit
         return {
             "inference_library": "pyro_dynogp",
-            "inference_library_version": pyro_dynogp.__version__,
+            "inference_library_version": __version__,
             "method": fit.method,
             "seed": fit.seed,
             "record_fingerprints": " ".join(fit.training),

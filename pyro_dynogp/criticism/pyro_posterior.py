@@ -12,7 +12,6 @@ import torch
 import xarray as xr
 from torch import Tensor
 
-import pyro_dynogp
 from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.densities import Kind
 from pyro_dynogp.criticism.inference_data import NOT_FOR_LOO, pareto_attrs
@@ -28,6 +27,7 @@ from pyro_dynogp.criticism.site_dimensions import dimensions_for
 from pyro_dynogp.criticism.subjects import Subject, fingerprint_of, no_refit
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.parallel import seeded
+from pyro_dynogp.support.version import __version__
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +162,7 @@ class PyroPosterior:
         }
         attrs = {
             "inference_library": "pyro_dynogp",
-            "inference_library_version": pyro_dynogp.__version__,
+            "inference_library_version": __version__,
             "draws": self.draws.kind,
             "seed": self.seed,
         }

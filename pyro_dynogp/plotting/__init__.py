@@ -2,6 +2,7 @@
 
 Every function returns a matplotlib Figure that belongs to nobody else: no pyplot, no global state,
 no display needed. Save it with ``figure.savefig("name.png")``; a notebook shows it as it is.
+Figures of closing the loop are in `pyro_dynogp.report.figures`.
 """
 
 from pyro_dynogp.plotting.calibration import calibration, predictive_checks
@@ -9,13 +10,10 @@ from pyro_dynogp.plotting.diagnostics import history, residuals, starts
 from pyro_dynogp.plotting.signals import prediction, record
 from pyro_dynogp.plotting.style import named
 from pyro_dynogp.plotting.systems import bode, impulse_response, pole_map
-from pyro_dynogp.report.figures import before_after, evidence, residuals_before_after
 
 __all__ = [
-    "before_after",
     "bode",
     "calibration",
-    "evidence",
     "history",
     "impulse_response",
     "named",
@@ -24,6 +22,5 @@ __all__ = [
     "predictive_checks",
     "record",
     "residuals",
-    "residuals_before_after",
     "starts",
 ]

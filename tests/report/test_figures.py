@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from pyro_dynogp import plotting
+from pyro_dynogp.report import figures as plotting
 from pyro_dynogp.statistics.evidence import Evidence
 from tests.discrepancy import reports
 
