@@ -6,12 +6,12 @@ Torch and Pyro are imported inside the commands, so that ``--help`` need not wai
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import click
 
 from pyro_dynogp.cli.close_loop import close_loop
-from pyro_dynogp.cli.data import InvalidInput, record_for, training_and_test
+from pyro_dynogp.cli.data import Clock, Columns, InvalidInput, record_for, training_and_test
 from pyro_dynogp.cli.options import CHANNELS, CLOCK, PAIRS, WORK, seed
 
 
@@ -136,9 +136,6 @@ def info(subject: str | None) -> None:
 @WORK
 def fit(
     data: str,
-    inputs: tuple[str, ...],
-    outputs: tuple[str, ...],
-    units: tuple[str, ...],
     train: int | None,
     pairs: int,
     method: Any,
@@ -149,7 +146,7 @@ def fit(
     figures: Path | None,
     workers: int | None,
     quiet: bool,
-    **clock: Any,
+    **columns: Unpack[Columns],
 ) -> None:
     """Fit a linear dynamic Gaussian process to DATA, a CSV file or the name of a data set.
 
@@ -169,7 +166,7 @@ def fit(
         _check_folder("--save", save)
     if figures is not None:
         figures.mkdir(parents=True, exist_ok=True)
-    parts = training_and_test(data, inputs, outputs, units, clock, train)
+    parts = training_and_test(data, columns, train)
     first, test = parts.train[0], parts.test
     model = dgp.LinearDynamicGP(inputs=first.n_inputs, outputs=first.n_outputs, pairs=pairs)
     fitted = dgp.fit(
@@ -214,7 +211,12 @@ def fit(
     help="Predict K samples ahead from measured outputs instead.",
 )  # fmt: skip
 def simulate(
-    model: Path, data: str, out: Path, no_process_noise: bool, horizon: int | None, **clock: Any
+    model: Path,
+    data: str,
+    out: Path,
+    no_process_noise: bool,
+    horizon: int | None,
+    **clock: Unpack[Clock],
 ) -> None:
     """Simulate the outputs of a saved MODEL from the inputs in DATA.
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Unpack
 
 import click
 
-from pyro_dynogp.cli.data import InvalidInput, whole_record
+from pyro_dynogp.cli.data import Columns, InvalidInput, whole_record
 from pyro_dynogp.cli.options import CHANNELS, PAIRS, WORK, seed
 
 
@@ -41,9 +41,6 @@ from pyro_dynogp.cli.options import CHANNELS, PAIRS, WORK, seed
 @WORK
 def close_loop(
     data: str,
-    inputs: tuple[str, ...],
-    outputs: tuple[str, ...],
-    units: tuple[str, ...],
     candidates: tuple[str, ...],
     kind: str,
     pairs: int,
@@ -53,7 +50,7 @@ def close_loop(
     out: Path,
     workers: int | None,
     quiet: bool,
-    **clock: Any,
+    **columns: Unpack[Columns],
 ) -> None:
     """Find what a model of DATA lacks, add it, and report how much better it predicts.
 
@@ -67,7 +64,7 @@ def close_loop(
       pyro-dynogp close-loop plant.csv --input valve --output level --time stamp \\
           --candidates ambient --candidates feed --pairs 3 --out report
     """  # noqa: D301
-    record, left_out = whole_record(data, inputs, outputs, units, clock, candidates)
+    record, left_out = whole_record(data, columns, candidates)
     import pyro_dynogp as dgp
     from pyro_dynogp.discrepancy.blocks import FEWEST
 

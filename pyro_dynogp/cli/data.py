@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import click
 
@@ -34,6 +34,23 @@ class InvalidInput(click.ClickException):
     exit_code = 2
 
 
+class Clock(TypedDict):
+    """Options about time, as in `Record.from_csv`."""
+
+    time: str | None
+    sampling_time: float | None
+    timezone: str | None
+    time_unit: str | None
+
+
+class Columns(Clock):
+    """What the columns of DATA are: names, NAME=UNIT of some of them, and the clock."""
+
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    units: tuple[str, ...]
+
+
 @dataclass(frozen=True)
 class Parts:
     """What a fit is trained and tested on.
@@ -60,23 +77,16 @@ def existing(subject: str) -> Path:
     return path
 
 
-def training_and_test(
-    data: str,
-    inputs: tuple[str, ...],
-    outputs: tuple[str, ...],
-    units: tuple[str, ...],
-    clock: dict[str, Any],
-    train: int | None,
-) -> Parts:
+def training_and_test(data: str, columns: Columns, train: int | None) -> Parts:
     """Read a CSV file or a data set, and split it.
 
     Args:
-        data: file or name. inputs: names of columns. outputs: names of columns.
-        units: NAME=UNIT of these columns. clock: options of `Record.from_csv` about time.
+        data: file or name. columns: what its columns are.
         train: number of training samples; None for all of a file, or for the split of a data set.
     """
+    inputs, outputs = columns["inputs"], columns["outputs"]
     if data in DATASETS:
-        _refuse(data, clock | {"unit": units})
+        _refuse(data, columns)
         dataset = _selected(data, inputs, outputs)
         if train is None:
             first = dataset.train
@@ -91,12 +101,12 @@ def training_and_test(
         raise InvalidInput(
             f"--output: name one output column or more; pyro-dynogp info {path} lists the columns."
         )
-    known = _units(units, (*inputs, *outputs))
+    known = _units(columns["units"], (*inputs, *outputs))
     record = _from_csv(
         path,
         inputs,
         outputs,
-        clock,
+        columns,
         input_units=[known.get(name, "") for name in inputs],
         output_units=[known.get(name, "") for name in outputs],
     )
@@ -106,7 +116,7 @@ def training_and_test(
     return Parts((before,), after, follows=True)
 
 
-def record_for(fitted: Fit, data: str, clock: dict[str, Any]) -> tuple[Record, bool]:
+def record_for(fitted: Fit, data: str, clock: Clock) -> tuple[Record, bool]:
     """Record with the channels of a fit, and whether its outputs were measured.
 
     Args:
@@ -126,7 +136,7 @@ def record_for(fitted: Fit, data: str, clock: dict[str, Any]) -> tuple[Record, b
         path,
         scaling.input_names,
         scaling.output_names if measured else (),
-        clock | {"time_unit": clock["time_unit"] or scaling.time_unit},
+        {**clock, "time_unit": clock["time_unit"] or scaling.time_unit},
         input_units=scaling.input_units,
         output_units=scaling.output_units if measured else (),
     )
@@ -134,27 +144,22 @@ def record_for(fitted: Fit, data: str, clock: dict[str, Any]) -> tuple[Record, b
 
 
 def whole_record(
-    data: str,
-    inputs: tuple[str, ...],
-    outputs: tuple[str, ...],
-    units: tuple[str, ...],
-    clock: dict[str, Any],
-    candidates: tuple[str, ...],
+    data: str, columns: Columns, candidates: tuple[str, ...]
 ) -> tuple[Record, tuple[str, ...]]:
     """Read a CSV file or a data set with the channels that a model does not use.
 
     Args:
-        data: file or name. inputs: names of columns. outputs: names of columns.
-        units: NAME=UNIT of columns. clock: options of `Record.from_csv` about time.
+        data: file or name. columns: what its columns are.
         candidates: columns to keep as extra channels; none named for all that hold numbers.
 
     Returns:
         The record, and the columns left out since they hold text or nothing.
     """
+    inputs, outputs = columns["inputs"], columns["outputs"]
     if twice := set(candidates) & {*inputs, *outputs}:
         raise InvalidInput(f"--candidates: {sorted(twice)} are inputs or outputs already.")
     if data in DATASETS:
-        _refuse(data, clock | {"unit": units})
+        _refuse(data, columns)
         record = _selected(data, inputs, outputs).full
         if record is None:
             raise InvalidInput(f"{data}: is not one record, which closing the loop needs.")
@@ -169,14 +174,14 @@ def whole_record(
         raise InvalidInput(
             f"--output: name one output column or more; pyro-dynogp info {path} lists the columns."
         )
-    used = (*inputs, *outputs, clock["time"])
+    used = (*inputs, *outputs, columns["time"])
     extra, left_out = (candidates, ()) if candidates else _numeric(path, used)
-    known = _units(units, (*inputs, *outputs, *extra))
+    known = _units(columns["units"], (*inputs, *outputs, *extra))
     record = _from_csv(
         path,
         inputs,
         outputs,
-        clock,
+        columns,
         extra=extra,
         input_units=[known.get(name, "") for name in inputs],
         output_units=[known.get(name, "") for name in outputs],
@@ -209,7 +214,7 @@ def _from_csv(
     path: Path,
     inputs: tuple[str, ...],
     outputs: tuple[str, ...],
-    clock: dict[str, Any],
+    clock: Clock,
     extra: tuple[str, ...] = (),
     **units: Any,
 ) -> Record:
@@ -218,8 +223,11 @@ def _from_csv(
     # The reader complains likewise, but in terms of Python arguments.
     if (clock["time"] is None) == (clock["sampling_time"] is None):
         raise InvalidInput("--time COLUMN or --sampling-time S: give one of the two.")
-    clock = clock | {"time_unit": clock["time_unit"] or "s"}
-    return Record.from_csv(path, inputs, outputs, extra=extra, **clock, **units)
+    return Record.from_csv(
+        path, inputs, outputs, extra=extra, time=clock["time"],
+        sampling_time=clock["sampling_time"], timezone=clock["timezone"],
+        time_unit=clock["time_unit"] or "s", **units,
+    )  # fmt: skip
 
 
 def _units(pairs: tuple[str, ...], names: tuple[str, ...]) -> dict[str, str]:
@@ -234,13 +242,13 @@ def _units(pairs: tuple[str, ...], names: tuple[str, ...]) -> dict[str, str]:
     return units
 
 
-def _refuse(data: str, options: dict[str, Any]) -> None:
+def _refuse(data: str, options: Clock | Columns) -> None:
     """Refuse what only a file needs."""
-    for name in ("time", "sampling_time", "timezone", "time_unit", "unit"):
+    for name in ("time", "sampling_time", "timezone", "time_unit", "units"):
         if options.get(name):
+            option = name.replace("_", "-").removesuffix("s")
             raise InvalidInput(
-                f"--{name.replace('_', '-')}: for CSV files; the data set {data} has its own clock "
-                "and units."
+                f"--{option}: for CSV files; the data set {data} has its own clock and units."
             )
 
 

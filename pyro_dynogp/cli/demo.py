@@ -42,7 +42,9 @@ class Result:
     scores: Mapping[str, Any]
 
 
-def evaluate(fit: Fit, test: Record, *, past: Record | None = None, skip: int = 0) -> dict:
+def evaluate(
+    fit: Fit, test: Record, *, past: Record | None = None, skip: int = 0
+) -> dict[str, Result]:
     """Predict test data in every way there is, and score it.
 
     Args:

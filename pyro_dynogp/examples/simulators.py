@@ -168,9 +168,8 @@ def simulate_lti(
     Raises:
         ValueError: a number out of its range.
     """
-    _check(samples, training_samples, sampling_time, noise_ratio)
-    system, process, measurement = _generators(seed)
-    time, inputs = _two_sines(samples, sampling_time)
+    setting = _setting(seed, samples, training_samples, sampling_time, noise_ratio)
+    system, inputs = setting.system, setting.inputs
     pairs, n_u = 5, inputs.shape[1]
     frequency = np.exp(system.uniform(np.log(1.0), np.log(25.0), pairs))
     damping = system.uniform(0.2, 0.9, pairs)
@@ -185,15 +184,12 @@ def simulate_lti(
     C_r = np.column_stack([2 * c.real, -2 * c.imag]).reshape(1, 2 * pairs)
     L_r = np.column_stack([L.real, L.imag]).reshape(2 * pairs, 1)
     B_r = np.stack([B.real, B.imag], axis=1).reshape(2 * pairs, n_u)
-    quiet = simulate_states(A_r, B_r, L_r, inputs, sampling_time, process, noisy_samples=0)
+    quiet = simulate_states(A_r, B_r, L_r, inputs, sampling_time, setting.process, noisy_samples=0)
     by_pair = (quiet * C_r).reshape(samples, pairs, 2).sum(axis=2)
     B_r = B_r * np.repeat(spread / by_pair.std(axis=0), 2)[:, None]
     driven = (by_pair * (spread / by_pair.std(axis=0))).sum(axis=1).var()
     L_r = L_r * np.sqrt(share / (1 - share) * driven / _stationary_variance(A_r, C_r, L_r))
-    return _experiment(
-        A_r, B_r, C_r, L_r, "identity", time, inputs, training_samples, sampling_time,
-        noise_ratio, process, measurement, name=f"lti {seed}",
-    )  # fmt: skip
+    return _experiment(A_r, B_r, C_r, L_r, "identity", setting, name=f"lti {seed}")
 
 
 def simulate_wiener(
@@ -229,43 +225,51 @@ def simulate_wiener(
     Raises:
         ValueError: a number out of its range.
     """
-    _check(samples, training_samples, sampling_time, noise_ratio)
-    system, process, measurement = _generators(seed)
-    time, inputs = _two_sines(samples, sampling_time)
+    setting = _setting(seed, samples, training_samples, sampling_time, noise_ratio)
+    system, inputs = setting.system, setting.inputs
     v = system.uniform(0, 50, 5)
     A = -np.diag(system.uniform(0, 50, 5)) - np.outer(v, v)
     B = system.normal(0, 50, (5, inputs.shape[1]))
     C = system.standard_normal((1, 5))
     L = system.normal(0, np.sqrt(0.5), (5, 1))
-    return _experiment(
-        A, B, C, L, "positive part", time, inputs, training_samples, sampling_time,
-        noise_ratio, process, measurement, name=f"wiener {seed}",
-    )  # fmt: skip
+    return _experiment(A, B, C, L, "positive part", setting, name=f"wiener {seed}")
 
 
-def _check(samples: int, training_samples: int, sampling_time: float, noise_ratio: float) -> None:
+@dataclass(frozen=True)
+class _Setting:
+    """How a system is excited and measured, and the streams of its random numbers."""
+
+    time: Array
+    inputs: Array
+    step: float
+    training_samples: int
+    noise_ratio: float
+    system: np.random.Generator
+    process: np.random.Generator
+    measurement: np.random.Generator
+
+
+def _setting(
+    seed: int, samples: int, training_samples: int, step: float, noise_ratio: float
+) -> _Setting:
+    """Inputs sin(3 pi t) and sin(5 pi t) at n samples; all numbers are checked."""
     if not 2 <= training_samples < samples:
         raise invalid(
             "training_samples",
             expected=f"between 2 and samples - 1 = {samples - 1}",
             got=f"{training_samples}",
         )
-    if not 0 < sampling_time < np.inf:
-        raise invalid("sampling_time", expected="a positive number [s]", got=f"{sampling_time}")
+    if not 0 < step < np.inf:
+        raise invalid("sampling_time", expected="a positive number [s]", got=f"{step}")
     if not 0 <= noise_ratio < np.inf:
         raise invalid("noise_ratio", expected="zero or a positive number", got=f"{noise_ratio}")
-
-
-def _generators(seed: int) -> list[np.random.Generator]:
-    """Independent streams: another length or noise leaves the draws of the system as they are."""
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
         raise invalid("seed", expected="an integer, zero or positive", got=repr(seed))
-    return [np.random.default_rng(s) for s in np.random.SeedSequence(int(seed)).spawn(3)]
-
-
-def _two_sines(samples: int, step: float) -> tuple[Array, Array]:
+    # Independent streams: another length or noise leaves the draws of the system as they are.
+    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(int(seed)).spawn(3)]
     time: Array = np.arange(samples, dtype=np.float64) * step
-    return time, np.column_stack([np.sin(3 * np.pi * time), np.sin(5 * np.pi * time)])
+    inputs = np.column_stack([np.sin(3 * np.pi * time), np.sin(5 * np.pi * time)])
+    return _Setting(time, inputs, step, training_samples, noise_ratio, *streams)
 
 
 def _stationary_variance(A: Array, C: Array, L: Array) -> float:
@@ -274,18 +278,18 @@ def _stationary_variance(A: Array, C: Array, L: Array) -> float:
 
 
 def _experiment(
-    A: Array, B: Array, C: Array, L: Array, nonlinearity: str, time: Array, inputs: Array,
-    training_samples: int, step: float, noise_ratio: float,
-    process: np.random.Generator, measurement: np.random.Generator, *, name: str,
-) -> Simulation:  # fmt: skip
-    k = training_samples
-    states = simulate_states(A, B, L, inputs, step, process, noisy_samples=k)
-    quiet = simulate_states(A, B, L, inputs, step, process, noisy_samples=0) @ C[0]
+    A: Array, B: Array, C: Array, L: Array, nonlinearity: str, setting: _Setting, *, name: str
+) -> Simulation:
+    k, step, inputs = setting.training_samples, setting.step, setting.inputs
+    states = simulate_states(A, B, L, inputs, step, setting.process, noisy_samples=k)
+    quiet = simulate_states(A, B, L, inputs, step, setting.process, noisy_samples=0) @ C[0]
     linear = states @ C[0]
     clean = np.maximum(linear, 0.0) if nonlinearity == "positive part" else linear
-    noise_sd = noise_ratio * float(clean.std())
-    outputs = clean + noise_sd * measurement.standard_normal(len(clean))
-    record = Record(time, inputs, outputs, input_units=["", ""], output_units=[""], name=name)
+    noise_sd = setting.noise_ratio * float(clean.std())
+    outputs = clean + noise_sd * setting.measurement.standard_normal(len(clean))
+    record = Record(
+        setting.time, inputs, outputs, input_units=["", ""], output_units=[""], name=name
+    )
     train, test = record.split(k)
     noise_variance = _stationary_variance(A, C, L)
     truth = Truth(

@@ -57,8 +57,9 @@ def times(S, x, out):
         out[i] = 0.0
     for j in range(n):
         xj = x[j]
-        for i in range(n):
-            out[i] += S[j, i] * xj
+        if xj != 0.0:  # rows of outputs read few states
+            for i in range(n):
+                out[i] += S[j, i] * xj
 
 
 @njit(**BORROWING)

@@ -21,6 +21,8 @@ recompute the state from checkpoints, so that memory stays near O(n J).
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
@@ -79,77 +81,79 @@ def factor(re, im, step, out, h, g, k0, v, S0):
     return e, p, S_end
 
 
+class _Rows(NamedTuple):
+    """The rows of one batch element, or the gradients by them: arrays as in `factor`."""
+
+    re: np.ndarray
+    im: np.ndarray
+    step: np.ndarray
+    out: np.ndarray
+    h: np.ndarray
+    g: np.ndarray
+    k0: np.ndarray
+    v: np.ndarray
+
+
+class _Segment(NamedTuple):
+    """Of each row of a segment: S before its sample, e, and 1 / d."""
+
+    before: np.ndarray
+    errors: np.ndarray
+    inverse: np.ndarray
+
+
 @njit(**BORROWING)
-def _factor_segment(b, first, last, re, im, step, out, h, g, k0, v, S, s, before, errors, inverse):
-    """Advance S over rows first..last - 1 and keep of each: S before its sample, e and 1 / d."""
+def _factor_segment(first, last, rows, S, s, kept):
+    """Advance S over rows first..last - 1 and keep what a `_Segment` has."""
     for i in range(first, last):
         m = i - first
-        o = out[i]
-        move(S, re[b], im[b], step[i])
-        copy(S, before[m])
-        p = _use_row(S, h[b, o], g[b, o], k0[b, o], v[b, i], s, errors[m])
-        inverse[m] = 1.0 / (p + v[b, i])
+        o = rows.out[i]
+        move(S, rows.re, rows.im, rows.step[i])
+        copy(S, kept.before[m])
+        p = _use_row(S, rows.h[o], rows.g[o], rows.k0[o], rows.v[i], s, kept.errors[m])
+        kept.inverse[m] = 1.0 / (p + rows.v[i])
 
 
 @njit(**BORROWING)
-def _factor_row_adjoint(
-    b,
-    i,
-    m,
-    out,
-    h,
-    g,
-    e_bar,
-    p_bar,
-    before,
-    errors,
-    inverse,
-    bar,
-    s,
-    t,
-    h_bar,
-    g_bar,
-    k0_bar,
-    v_bar,
-):
+def _factor_row_adjoint(i, m, rows, bars, e_bar, p_bar, kept, bar, s, t):
     """Reverse of a row's sample: gradients are added, `bar` is then that before the sample."""
-    o = out[i]
-    ei = errors[m]
+    o = rows.out[i]
+    h, g, h_bar, g_bar = rows.h[o], rows.g[o], bars.h[o], bars.g[o]
+    ei = kept.errors[m]
+    inverse = kept.inverse[m]
     times(bar, ei, t)
-    through_d = -dot(ei, t) * inverse[m] * inverse[m]
-    pb = p_bar[b, i] + through_d
-    v_bar[b, i] = through_d
-    k0_bar[b, o] += pb
+    through_d = -dot(ei, t) * inverse * inverse
+    pb = p_bar[i] + through_d
+    bars.v[i] = through_d
+    bars.k0[o] += pb
     for j in range(s.shape[0]):
-        eb = e_bar[b, i, j] + 2.0 * inverse[m] * t[j]
-        g_bar[b, o, j] += eb
-        h_bar[b, o, j] -= pb * (g[b, o, j] - ei[j])
-        s[j] = -eb - pb * h[b, o, j]  # adjoint of s = S h
-    times(before[m], s, t)
+        eb = e_bar[i, j] + 2.0 * inverse * t[j]
+        g_bar[j] += eb
+        h_bar[j] -= pb * (g[j] - ei[j])
+        s[j] = -eb - pb * h[j]  # adjoint of s = S h
+    times(kept.before[m], s, t)
     for j in range(s.shape[0]):
-        h_bar[b, o, j] += t[j]
-    add_outer(bar, 0.5, s, h[b, o])
-    add_outer(bar, 0.5, h[b, o], s)
+        h_bar[j] += t[j]
+    add_outer(bar, 0.5, s, h)
+    add_outer(bar, 0.5, h, s)
 
 
 @njit(**BORROWING)
-def _factor_step_adjoint(
-    b, k, m, re, im, back, start, before, errors, inverse, bar, Q, re_bar, im_bar
-):
+def _factor_step_adjoint(k, m, rows, bars, back, start, kept, bar, Q):
     """Reverse of a row's step k. start: S before the segment."""
     # Q' = Phi S_previous, S_previous after the update of the row before.
     if m > 0:
-        copy(before[m - 1], Q)
-        add_outer(Q, inverse[m - 1], errors[m - 1], errors[m - 1])
+        copy(kept.before[m - 1], Q)
+        add_outer(Q, kept.inverse[m - 1], kept.errors[m - 1], kept.errors[m - 1])
     else:
         copy(start, Q)
-    rotate_columns(Q, re[b, k], im[b, k])
+    rotate_columns(Q, rows.re[k], rows.im[k])
     for j in range(Q.shape[0]):
         for l in range(Q.shape[0]):
             Q[j, l] *= 2.0
-    add_step_gradient(bar, Q, re_bar[b, k], im_bar[b, k])
-    rotate_rows(bar, re[b, k], back[b, k])
-    rotate_columns(bar, re[b, k], back[b, k])
+    add_step_gradient(bar, Q, bars.re[k], bars.im[k])
+    rotate_rows(bar, rows.re[k], back[k])
+    rotate_columns(bar, rows.re[k], back[k])
 
 
 @njit(**OPTIONS)
@@ -168,40 +172,30 @@ def factor_adjoint(re, im, step, out, h, g, k0, v, S0, e_bar, p_bar, S_end_bar):
     length = SEGMENT
     segments = (n + length - 1) // length
     starts = np.empty((segments, J, J))
-    before = np.empty((length, J, J))  # S after moving to the row, before using its sample
-    errors = np.empty((length, J))
-    inverse = np.empty(length)
+    kept = _Segment(np.empty((length, J, J)), np.empty((length, J)), np.empty(length))
     S = np.empty((J, J))
     Q = np.empty((J, J))
     s = np.empty(J)
     t = np.empty(J)
     for b in range(batch):
+        rows = _Rows(re[b], im[b], step, out, h[b], g[b], k0[b], v[b])
+        bars = _Rows(re_bar[b], im_bar[b], step, out, h_bar[b], g_bar[b], k0_bar[b], v_bar[b])
         S[:] = S0[b]
         for segment in range(segments):
             starts[segment] = S
             first = segment * length
             last = min(n, first + length)
-            _factor_segment(
-                b, first, last, re, im, step, out, h, g, k0, v, S, s, before, errors, inverse
-            )
+            _factor_segment(first, last, rows, S, s, kept)
         bar = S0_bar[b]
         for segment in range(segments - 1, -1, -1):
             first = segment * length
             last = min(n, first + length)
             start = starts[segment]
             S[:] = start
-            _factor_segment(
-                b, first, last, re, im, step, out, h, g, k0, v, S, s, before, errors, inverse
-            )
+            _factor_segment(first, last, rows, S, s, kept)
             for i in range(last - 1, first - 1, -1):
                 m = i - first
-                _factor_row_adjoint(
-                    b, i, m, out, h, g, e_bar, p_bar, before, errors, inverse, bar, s, t,
-                    h_bar, g_bar, k0_bar, v_bar,
-                )  # fmt: skip
+                _factor_row_adjoint(i, m, rows, bars, e_bar[b], p_bar[b], kept, bar, s, t)
                 if step[i] >= 0:
-                    _factor_step_adjoint(
-                        b, step[i], m, re, im, back, start, before, errors, inverse, bar, Q,
-                        re_bar, im_bar,
-                    )  # fmt: skip
+                    _factor_step_adjoint(step[i], m, rows, bars, back[b], start, kept, bar, Q)
     return re_bar, im_bar, h_bar, g_bar, k0_bar, v_bar, S0_bar

@@ -4,4 +4,5 @@ from pathlib import Path
 
 from pyro_dynogp.support.compiled import drop_stale
 
-drop_stale(Path(__file__).parent)
+_HERE = Path(__file__).parent
+drop_stale(_HERE, _HERE.parent / "lti")

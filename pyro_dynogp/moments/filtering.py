@@ -14,14 +14,13 @@ import math
 import numpy as np
 from numba import njit
 
+from pyro_dynogp.lti.arithmetic import SEGMENT, dot, times
 from pyro_dynogp.moments.layout import FLOOR, workspace
 from pyro_dynogp.moments.measured_function import function_terms
 from pyro_dynogp.moments.noise import noise_terms
-from pyro_dynogp.moments.state import covary, dot, move, update
+from pyro_dynogp.moments.state import move, update
 from pyro_dynogp.moments.static_layer import append
 from pyro_dynogp.support.compiled import BORROWING, INLINED, OPTIONS
-
-SEGMENT = 64
 
 
 @njit(**BORROWING)
@@ -44,7 +43,7 @@ def seen(o, layout, values):
 def output_terms(time, o, layout, values, m, P, c, work):
     """Write the covariance c of a with what output o is measured through; l, alpha and beta."""
     h = seen(o, layout, values)[: m.shape[0]]
-    covary(P, h, c)
+    times(P, h, c)
     y = values.y[time, o] - values.y_offset[time, o]
     R = values.R[time, o]
     if layout.measured >= 0:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -98,66 +99,67 @@ def radial(form, square):
     return (1.0 + a * r + 5.0 / 3.0 * square) * value, -5.0 / 6.0 * (1.0 + a * r) * value
 
 
+class Expansion(NamedTuple):
+    """Numbers of one radial expansion of d channels and e outputs, or the gradients by them.
+
+    Attributes:
+        Z: (M, d). inverse: (d,). weight: (e, M). constant: (e,). slope: (e, d).
+    """
+
+    Z: np.ndarray
+    inverse: np.ndarray
+    weight: np.ndarray
+    constant: np.ndarray
+    slope: np.ndarray
+
+
 @njit(**BORROWING)
-def expansion(form, z, Z, inverse, weight, constant, slope, f):
+def expansion(form, z, part, f):
     """Write the outputs f (e,) of a radial expansion at z (d,)."""
     e = f.shape[0]
     d = z.shape[0]
     for a in range(e):
-        f[a] = constant[a]
+        f[a] = part.constant[a]
         for c in range(d):
-            f[a] += slope[a, c] * z[c]
-    for m in range(Z.shape[0]):
+            f[a] += part.slope[a, c] * z[c]
+    for m in range(part.Z.shape[0]):
         square = 0.0
         for c in range(d):
-            t = (z[c] - Z[m, c]) * inverse[c]
+            t = (z[c] - part.Z[m, c]) * part.inverse[c]
             square += t * t
         value, _ = radial(form, square)
         for a in range(e):
-            f[a] += weight[a, m] * value
+            f[a] += part.weight[a, m] * value
 
 
 @njit(**BORROWING)
-def expansion_adjoint(
-    form,
-    z,
-    Z,
-    inverse,
-    weight,
-    slope,
-    f_bar,
-    z_bar,
-    Z_bar,
-    inverse_bar,
-    weight_bar,
-    constant_bar,
-    slope_bar,
-):
-    """Add the gradients of a radial expansion at z, given those of its outputs."""
+def expansion_adjoint(form, z, part, f_bar, z_bar, bars):
+    """Add the gradients by z and by the parts of an expansion to z_bar and bars, given f_bar."""
     e = f_bar.shape[0]
     d = z.shape[0]
+    inverse = part.inverse
     for a in range(e):
-        constant_bar[a] += f_bar[a]
+        bars.constant[a] += f_bar[a]
         for c in range(d):
-            slope_bar[a, c] += f_bar[a] * z[c]
-            z_bar[c] += f_bar[a] * slope[a, c]
-    for m in range(Z.shape[0]):
+            bars.slope[a, c] += f_bar[a] * z[c]
+            z_bar[c] += f_bar[a] * part.slope[a, c]
+    for m in range(part.Z.shape[0]):
         square = 0.0
         for c in range(d):
-            t = (z[c] - Z[m, c]) * inverse[c]
+            t = (z[c] - part.Z[m, c]) * inverse[c]
             square += t * t
         value, derivative = radial(form, square)
         total = 0.0
         for a in range(e):
-            weight_bar[a, m] += f_bar[a] * value
-            total += f_bar[a] * weight[a, m]
+            bars.weight[a, m] += f_bar[a] * value
+            total += f_bar[a] * part.weight[a, m]
         square_bar = 2.0 * total * derivative
         for c in range(d):
-            difference = z[c] - Z[m, c]
+            difference = z[c] - part.Z[m, c]
             t = square_bar * inverse[c] * inverse[c] * difference
             z_bar[c] += t
-            Z_bar[m, c] -= t
-            inverse_bar[c] += square_bar * difference * difference * inverse[c]
+            bars.Z[m, c] -= t
+            bars.inverse[c] += square_bar * difference * difference * inverse[c]
 
 
 @lru_cache

@@ -181,7 +181,7 @@ def function_adjoint(i, y, R, centre, p, layout, values, bars, work, alpha_bar, 
     """
     root = math.sqrt(p)
     _evaluate(i, layout, values, centre, root, work)
-    at, weights, w4, s4 = work.at, work.weights, work.weight4, work.slope4
+    at, weights = work.at, work.weights
     _weigh(y, R, layout.share, layout.multiple, at, weights)
     mean, variance = _moments(y, R, layout.multiple, at, weights)
     beta = (1.0 - variance) / p
@@ -191,12 +191,8 @@ def function_adjoint(i, y, R, centre, p, layout, values, bars, work, alpha_bar, 
     p_bar = -0.5 * alpha_bar * mean / (p * root) - beta_bar * beta / p
     R_bar = 0.0
     y_bar = 0.0
-    curve_bar = work.curve_bar
     work.at_bar[:] = 0.0
-    curve_bar[:] = 0.0
-    f_bar = work.at_bar[0]
-    v_bar = work.at_bar[1]
-    slope_bar = work.at_bar[2]
+    f_bar, v_bar, slope_bar = work.at_bar[0], work.at_bar[1], work.at_bar[2]
     K = layout.multiple.shape[0]
     level = mean_bar * mean + second_bar * (variance + mean * mean)  # what weights have in common
     for q in range(COUNT):
@@ -220,7 +216,16 @@ def function_adjoint(i, y, R, centre, p, layout, values, bars, work, alpha_bar, 
             R_bar += S_bar * layout.multiple[k]
             f_bar[q] -= r_bar
             y_bar += r_bar
-    f = work.curve
+    centre_bar, root_bar = _evaluate_adjoint(i, layout, values, bars, centre, root, work)
+    return y_bar, R_bar, centre_bar, p_bar + 0.5 * root_bar / root
+
+
+@njit(**BORROWING)
+def _evaluate_adjoint(i, layout, values, bars, centre, root, work):
+    """Reverse of `_evaluate`, of work.at_bar: adds to bars; gradients by centre and root."""
+    f, curve_bar, w4, s4 = work.curve, work.curve_bar, work.weight4, work.slope4
+    f_bar, v_bar, slope_bar = work.at_bar[0], work.at_bar[1], work.at_bar[2]
+    curve_bar[:] = 0.0
     for q in range(COUNT):
         bend = f[q] - 2.0 * f[q + 2] + f[q + 4]
         bend_bar = f_bar[q] / 6.0 + v_bar[q] * bend / 9.0
@@ -260,7 +265,7 @@ def function_adjoint(i, y, R, centre, p, layout, values, bars, work, alpha_bar, 
         root_bar += z_bar * SPACING * (j - REACH - 2)
     bars.low[i] -= centre_bar
     bars.spacing[i] += spacing_bar
-    return y_bar, R_bar, centre_bar, p_bar + 0.5 * root_bar / root
+    return centre_bar, root_bar
 
 
 @njit(**BORROWING)

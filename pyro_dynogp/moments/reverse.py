@@ -10,34 +10,29 @@ import math
 import numpy as np
 from numba import njit
 
-from pyro_dynogp.moments.filtering import (
-    SEGMENT,
-    enter,
-    inner,
-    measure,
-    output_terms,
-    seen,
-    width,
-)
+from pyro_dynogp.lti.arithmetic import SEGMENT, dot, times
+from pyro_dynogp.moments.filtering import inner, seen, width
 from pyro_dynogp.moments.layout import FLOOR, workspace
 from pyro_dynogp.moments.measured_function import function_adjoint
 from pyro_dynogp.moments.noise import noise_adjoint
-from pyro_dynogp.moments.state import covary, dot, move_adjoint, update
-from pyro_dynogp.moments.static_layer import append, append_adjoint
+from pyro_dynogp.moments.segments import replay, restore, room
+from pyro_dynogp.moments.state import move_adjoint, update
+from pyro_dynogp.moments.static_layer import append_adjoint
 from pyro_dynogp.support.compiled import BORROWING, OPTIONS
 
 
 @njit(**BORROWING)
-def _measure_adjoint(time, layout, values, bars, m, P, m_bar, P_bar, C, alphas, betas, c_bar, work):
+def _measure_adjoint(time, k, layout, values, bars, m, P, m_bar, P_bar, c_bar, work, kept):
     """Reverse of `measure`: m and P go back to what they were, bars change in place."""
     A = m.shape[0]
+    alphas, betas = kept.alphas[k], kept.betas[k]
     for o in range(values.y.shape[1] - 1, -1, -1):
         if math.isnan(values.y[time, o]):
             continue
         h = seen(o, layout, values)[:A]
-        c = C[o]
+        c = kept.C[o]
         update(P, m, c, -alphas[o], -betas[o])
-        covary(P_bar, c, c_bar)
+        times(P_bar, c, c_bar)
         beta_bar = -dot(c, c_bar)
         alpha_bar = dot(c, m_bar)
         for j in range(A):
@@ -86,7 +81,6 @@ def _measure_adjoint(time, layout, values, bars, m, P, m_bar, P_bar, C, alphas, 
 def run_adjoint(layout, values, bars, means, covariances):
     """Gradient of the log-density that `run` returns, added to bars."""
     n = layout.step.shape[0]
-    n_y = values.y.shape[1]
     N = values.m0.shape[0]
     A = width(layout, values)
     S = inner(layout)
@@ -97,57 +91,22 @@ def run_adjoint(layout, values, bars, means, covariances):
     work = workspace(layout, values)
     T = np.empty((N, A))
     T_bar = np.empty((N, A))
-    C = np.zeros((n_y, A))
     c_bar = np.empty(A)
-    alphas = np.zeros((SEGMENT, n_y))
-    betas = np.zeros((SEGMENT, n_y))
-    before_m = np.empty((SEGMENT, N))
-    before_P = np.empty((SEGMENT, N, N))
+    kept = room(values, A)
     for segment in range(means.shape[0] - 1, -1, -1):
         first = segment * SEGMENT
         last = min(n, first + SEGMENT)
         m[:N] = means[segment]
         P[:N, :N] = covariances[segment]
-        for time in range(first, last):
-            if time > first:
-                enter(time, layout, values, m, P, T)
-            before_m[time - first] = m[:N]
-            before_P[time - first] = P[:N, :N]
-            if time < last - 1:
-                for i in range(S):
-                    append(i, time, layout, values, m, P, work)
-                measure(
-                    time,
-                    layout,
-                    values,
-                    m,
-                    P,
-                    c_bar,
-                    work,
-                    alphas[time - first],
-                    betas[time - first],
-                )
+        replay(first, last, S, layout, values, m, P, T, c_bar, work, kept)
         for time in range(last - 1, first - 1, -1):
-            m[:N] = before_m[time - first]
-            P[:N, :N] = before_P[time - first]
-            for i in range(S):
-                append(i, time, layout, values, m, P, work)
-            alpha = alphas[time - first]
-            beta = betas[time - first]
-            for o in range(n_y):
-                if math.isnan(values.y[time, o]):
-                    continue
-                if time == last - 1:  # not measured above
-                    _, alpha[o], beta[o] = output_terms(time, o, layout, values, m, P, C[o], work)
-                else:
-                    covary(P, seen(o, layout, values)[:A], C[o])
-                update(P, m, C[o], alpha[o], beta[o])
+            restore(time, time - first, time == last - 1, S, layout, values, m, P, work, kept)
             if time < n - 1:
                 k = layout.step[time + 1]
                 if k >= 0:
                     move_adjoint(k, layout, values, bars, m, P, m_bar, P_bar, T, T_bar)
             _measure_adjoint(
-                time, layout, values, bars, m, P, m_bar, P_bar, C, alpha, beta, c_bar, work
+                time, time - first, layout, values, bars, m, P, m_bar, P_bar, c_bar, work, kept
             )
             for i in range(S - 1, -1, -1):
                 append_adjoint(i, time, layout, values, bars, m, P, m_bar, P_bar, work)

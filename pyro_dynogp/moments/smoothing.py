@@ -13,18 +13,20 @@ import math
 import numpy as np
 from numba import njit
 
-from pyro_dynogp.moments.filtering import SEGMENT, enter, inner, measure, output_terms, seen
+from pyro_dynogp.lti.arithmetic import SEGMENT, dot, times
+from pyro_dynogp.moments.filtering import enter, inner, measure, output_terms, seen
 from pyro_dynogp.moments.layout import FLOOR, workspace
 from pyro_dynogp.moments.measured_function import function_moments, function_terms
 from pyro_dynogp.moments.noise import noise_terms
-from pyro_dynogp.moments.state import covary, dot, step_back, update
+from pyro_dynogp.moments.segments import replay, restore, room
+from pyro_dynogp.moments.state import step_back, update
 from pyro_dynogp.moments.static_layer import append
 from pyro_dynogp.support.compiled import BORROWING, OPTIONS
 
 
 @njit(**BORROWING)
 def _quadratic(P, h, c):
-    covary(P, h, c)
+    times(P, h, c)
     return dot(h, c)
 
 
@@ -113,7 +115,7 @@ def predict_ahead(layout, values, horizon):
 
 
 @njit(**BORROWING)
-def _before_outputs(time, layout, values, bar, L, work, C, alphas, betas, m, P, t, cavity):
+def _before_outputs(time, k, layout, values, bar, L, m, P, t, work, kept, cavity):
     """Take lambda (A,) and Lambda (A, A) back over the outputs of a sample, undone in m and P.
 
     Writes to cavity (3, n, n_y) mean and variance of each noise-free output given all data but its
@@ -123,24 +125,25 @@ def _before_outputs(time, layout, values, bar, L, work, C, alphas, betas, m, P, 
     s - q/(1 + beta q) before it.
     """
     A = bar.shape[0]
+    alphas, betas = kept.alphas[k], kept.betas[k]
     for o in range(values.y.shape[1] - 1, -1, -1):
         if math.isnan(values.y[time, o]):
             continue
         h = seen(o, layout, values)
-        c = C[o]
+        c = kept.C[o]
         update(P, m, c, -alphas[o], -betas[o])
         along = dot(c, bar)
-        covary(L, c, t)
+        times(L, c, t)
         q = dot(c, t)
-        kept = 1.0 / (1.0 + betas[o] * q)
+        shrink = 1.0 / (1.0 + betas[o] * q)
         if cavity.size > 0:
             _predict(
                 time,
                 o,
                 layout,
                 values,
-                dot(h, m) + kept * (along + alphas[o] * q),
-                max(dot(h, c) - kept * q, 0.0),
+                dot(h, m) + shrink * (along + alphas[o] * q),
+                max(dot(h, c) - shrink * q, 0.0),
                 work,
                 cavity[:, time, o],
             )
@@ -207,7 +210,6 @@ def leave_one_out(layout, values, means, covariances):
 def _backwards(layout, values, rows, means, covariances, cavity):
     """What `smooth` returns; writes what `leave_one_out` does to cavity, unless that is empty."""
     n = layout.step.shape[0]
-    n_y = values.y.shape[1]
     N = values.m0.shape[0]
     A = values.G.shape[1]
     S = layout.channels.shape[0]
@@ -220,46 +222,27 @@ def _backwards(layout, values, rows, means, covariances, cavity):
     work = workspace(layout, values)
     T = np.empty((N, A))
     moved = np.empty((N, A))
-    C = np.zeros((n_y, A))
-    alphas = np.zeros(n_y)
-    betas = np.zeros(n_y)
     c = np.empty(A)
     t = np.empty(A)
-    before_m = np.empty((SEGMENT, N))
-    before_P = np.empty((SEGMENT, N, N))
+    kept = room(values, A)
     for segment in range(means.shape[0] - 1, -1, -1):
         first = segment * SEGMENT
         last = min(n, first + SEGMENT)
         m[:N] = means[segment]
         P[:N, :N] = covariances[segment]
-        for time in range(first, last):
-            if time > first:
-                enter(time, layout, values, m, P, T)
-            before_m[time - first] = m[:N]
-            before_P[time - first] = P[:N, :N]
-            for i in range(S):
-                append(i, time, layout, values, m, P, work)
-            measure(time, layout, values, m, P, c, work, alphas, betas)
+        replay(first, last, S, layout, values, m, P, T, c, work, kept)
         for time in range(last - 1, first - 1, -1):
-            m[:N] = before_m[time - first]
-            P[:N, :N] = before_P[time - first]
-            for i in range(S):
-                append(i, time, layout, values, m, P, work)
-            for o in range(n_y):
-                if math.isnan(values.y[time, o]):
-                    continue
-                _, alphas[o], betas[o] = output_terms(time, o, layout, values, m, P, C[o], work)
-                update(P, m, C[o], alphas[o], betas[o])
+            restore(time, time - first, time == last - 1, S, layout, values, m, P, work, kept)
             if time < n - 1 and layout.step[time + 1] >= 0:
                 k = layout.step[time + 1]
                 step_back(values.re[k], values.im[k], values.gamma[k], bar, L, moved)
-            covary(P, bar, c)
+            times(P, bar, c)
             for j in range(A):
                 mean[time, j] = m[j] + c[j]
             for row in range(rows.shape[0]):
-                covary(P, rows[row], c)
+                times(P, rows[row], c)
                 variance[time, row] = max(dot(rows[row], c) - _quadratic(L, c, t), 0.0)
-            _before_outputs(time, layout, values, bar, L, work, C, alphas, betas, m, P, t, cavity)
+            _before_outputs(time, time - first, layout, values, bar, L, m, P, t, work, kept, cavity)
             for i in range(S - 1, -1, -1):
                 _before_layer(i, layout, values, bar, L, work, t)
     return mean, variance

@@ -12,28 +12,6 @@ from pyro_dynogp.support.compiled import BORROWING
 
 
 @njit(**BORROWING)
-def dot(a, b):
-    """Inner product."""
-    total = 0.0
-    for i in range(a.shape[0]):
-        total += a[i] * b[i]
-    return total
-
-
-@njit(**BORROWING)
-def covary(P, h, c):
-    """Write P h to c."""
-    n = h.shape[0]
-    for i in range(n):
-        c[i] = 0.0
-    for j in range(n):
-        hj = h[j]
-        if hj != 0.0:
-            for i in range(n):
-                c[i] += P[j, i] * hj
-
-
-@njit(**BORROWING)
 def update(P, m, c, alpha, beta):
     """M <- m + alpha c, P <- P - beta c c'."""
     n = c.shape[0]

@@ -16,9 +16,15 @@ import math
 
 from numba import njit
 
-from pyro_dynogp.moments.functions import TABLE, expansion, expansion_adjoint, locate
+from pyro_dynogp.moments.functions import (
+    TABLE,
+    Expansion,
+    expansion,
+    expansion_adjoint,
+    locate,
+)
 from pyro_dynogp.moments.layout import FLOOR
-from pyro_dynogp.support.compiled import BORROWING
+from pyro_dynogp.support.compiled import BORROWING, INLINED
 
 
 @njit(**BORROWING)
@@ -36,195 +42,8 @@ def _cholesky(p, root):
 
 
 @njit(**BORROWING)
-def append(i, time, layout, values, m, P, work):
-    """Append the outputs of static layer i to the mean m and covariance P, in place."""
-    N = values.m0.shape[0]
-    d = layout.channels[i]
-    e = layout.outputs[i]
-    g0 = layout.g_start[i]
-    f0 = layout.f_start[i]
-    na = N + f0
-    W = work.W[i]
-    centre = work.centre[i]
-    root = work.root[i]
-    gain = work.gain[i]
-    cross = work.cross[i]
-    z, weight4, slope4 = work.z, work.weight4, work.slope4
-    for c in range(d):
-        G = values.G[g0 + c]
-        centre[c] = values.offset[time, g0 + c]
-        for j in range(na):
-            centre[c] += G[j] * m[j]
-        for k in range(na):
-            total = 0.0
-            for j in range(na):
-                total += P[k, j] * G[j]
-            W[k, c] = total
-    p = work.square
-    for c in range(d):
-        for b in range(c + 1):
-            total = 0.0
-            for j in range(na):
-                total += values.G[g0 + c, j] * W[j, b]
-            p[c, b] = total
-            p[b, c] = total
-    _cholesky(p[:d, :d], root[:d, :d])
-    mean = m[na : na + e]
-    block = P[na : na + e, na : na + e]
-    for a in range(e):
-        mean[a] = 0.0
-        for b in range(e):
-            block[a, b] = 0.0
-        for c in range(d):
-            cross[c, a] = 0.0
-    grid = values.table_mean.shape[1]
-    for q in range(layout.node_count[i]):
-        xi = layout.nodes[i, q]
-        wq = layout.node_weight[i, q]
-        for c in range(d):
-            z[c] = centre[c]
-            for b in range(c + 1):
-                z[c] += root[c, b] * xi[b]
-        f = work.f[i, q]
-        if layout.form[i] == TABLE:
-            k = locate(z[0], values.low[i], values.spacing[i], grid, weight4, slope4)
-            for a in range(e):
-                total = 0.0
-                variance = 0.0
-                for b in range(4):
-                    total += weight4[b] * values.table_mean[f0 + a, k + b]
-                    variance += weight4[b] * values.table_variance[f0 + a, k + b]
-                f[a] = total
-                block[a, a] += wq * variance
-        else:
-            expansion(
-                layout.form[i],
-                z[:d],
-                values.Z[i, :, :d],
-                values.inverse[i, :d],
-                values.weight[f0 : f0 + e],
-                values.constant[f0 : f0 + e],
-                values.slope[f0 : f0 + e],
-                f[:e],
-            )
-        for a in range(e):
-            mean[a] += wq * f[a]
-            for c in range(d):
-                cross[c, a] += wq * xi[c] * f[a]
-    for q in range(layout.node_count[i]):
-        wq = layout.node_weight[i, q]
-        f = work.f[i, q]
-        for a in range(e):
-            for b in range(e):
-                block[a, b] += wq * (f[a] - mean[a]) * (f[b] - mean[b])
-    # gain = L^{-T} cross
-    for a in range(e):
-        for c in range(d - 1, -1, -1):
-            total = cross[c, a]
-            for b in range(c + 1, d):
-                total -= root[b, c] * gain[b, a]
-            gain[c, a] = total / root[c, c]
-        for k in range(na):
-            total = 0.0
-            for c in range(d):
-                total += W[k, c] * gain[c, a]
-            P[k, na + a] = total
-            P[na + a, k] = total
-
-
-@njit(**BORROWING)
-def append_adjoint(i, time, layout, values, bars, m, P, m_bar, P_bar, work):
-    """Reverse mode of `append`: m_bar and P_bar (symmetric) lose the layer's outputs, in place."""
-    N = values.m0.shape[0]
-    d = layout.channels[i]
-    e = layout.outputs[i]
-    g0 = layout.g_start[i]
-    f0 = layout.f_start[i]
-    na = N + f0
-    W = work.W[i]
-    root = work.root[i]
-    gain = work.gain[i]
-    z, z_bar, w4, s4 = work.z, work.z_bar, work.weight4, work.slope4
-    cross_bar = work.cross_bar
-    W_bar = work.W_bar
-    root_bar = work.root_bar
-    centre_bar = work.centre_bar
-    f_bar = work.f_bar[:e]
-    W_bar[:na, :d] = 0.0
-    root_bar[:d, :d] = 0.0
-    centre_bar[:d] = 0.0
-    for a in range(e):
-        for c in range(d):
-            total = 0.0
-            for k in range(na):
-                covariance_bar = 2.0 * P_bar[k, na + a]
-                total += W[k, c] * covariance_bar
-                W_bar[k, c] += covariance_bar * gain[c, a]
-            cross_bar[c, a] = total
-        # cross_bar = L^{-1} gain_bar
-        for c in range(d):
-            total = cross_bar[c, a]
-            for b in range(c):
-                total -= root[c, b] * cross_bar[b, a]
-            cross_bar[c, a] = total / root[c, c]
-    for j in range(d):
-        for k in range(j + 1):
-            for a in range(e):
-                root_bar[j, k] -= gain[j, a] * cross_bar[k, a]
-    grid = values.table_mean.shape[1]
-    centre = work.centre[i]
-    for q in range(layout.node_count[i]):
-        xi = layout.nodes[i, q]
-        wq = layout.node_weight[i, q]
-        f = work.f[i, q]
-        for c in range(d):
-            z_bar[c] = 0.0
-            z[c] = centre[c]
-            for b in range(c + 1):
-                z[c] += root[c, b] * xi[b]
-        for a in range(e):
-            total = m_bar[na + a]
-            for c in range(d):
-                total += cross_bar[c, a] * xi[c]
-            for b in range(e):
-                total += 2.0 * P_bar[na + a, na + b] * (f[b] - m[na + b])
-            f_bar[a] = wq * total
-        if layout.form[i] == TABLE:
-            k = locate(z[0], values.low[i], values.spacing[i], grid, w4, s4)
-            for a in range(e):
-                v_bar = wq * P_bar[na + a, na + a]
-                for b in range(4):
-                    bars.table_mean[f0 + a, k + b] += f_bar[a] * w4[b]
-                    bars.table_variance[f0 + a, k + b] += v_bar * w4[b]
-                    z_bar[0] += s4[b] * (
-                        f_bar[a] * values.table_mean[f0 + a, k + b]
-                        + v_bar * values.table_variance[f0 + a, k + b]
-                    )
-            # The grid itself may move: f depends on (z - low) / spacing.
-            bars.low[i] -= z_bar[0]
-            bars.spacing[i] -= z_bar[0] * (z[0] - values.low[i]) / values.spacing[i]
-        else:
-            expansion_adjoint(
-                layout.form[i],
-                z[:d],
-                values.Z[i, :, :d],
-                values.inverse[i, :d],
-                values.weight[f0 : f0 + e],
-                values.slope[f0 : f0 + e],
-                f_bar,
-                z_bar[:d],
-                bars.Z[i, :, :d],
-                bars.inverse[i, :d],
-                bars.weight[f0 : f0 + e],
-                bars.constant[f0 : f0 + e],
-                bars.slope[f0 : f0 + e],
-            )
-        for c in range(d):
-            centre_bar[c] += z_bar[c]
-            for b in range(c + 1):
-                root_bar[c, b] += z_bar[c] * xi[b]
-    # Cholesky: p_bar = L^{-T} sym(tril(L' L_bar)) L^{-1}, its diagonal halved.
-    p_bar = work.square
+def _cholesky_adjoint(d, root, root_bar, p_bar):
+    """Write the gradient by p = L L': L^{-T} sym(tril(L' L_bar)) L^{-1}, its diagonal halved."""
     for c in range(d):
         for b in range(c + 1):
             total = 0.0
@@ -244,6 +63,215 @@ def append_adjoint(i, time, layout, values, bars, m, P, m_bar, P_bar, work):
             for k in range(c + 1, d):
                 total -= root[k, c] * p_bar[k, b]
             p_bar[c, b] = total / root[c, c]
+
+
+@njit(**INLINED)
+def _expansion(i, layout, numbers):
+    """The radial expansion of static layer i in `Values`, or the gradients by it."""
+    d = layout.channels[i]
+    first = layout.f_start[i]
+    last = first + layout.outputs[i]
+    return Expansion(
+        numbers.Z[i, :, :d],
+        numbers.inverse[i, :d],
+        numbers.weight[first:last],
+        numbers.constant[first:last],
+        numbers.slope[first:last],
+    )
+
+
+@njit(**BORROWING)
+def _project(i, time, layout, values, m, P, work):
+    """Mean of g, its covariance W with a, and the root of its own: all to the work arrays."""
+    d = layout.channels[i]
+    g0 = layout.g_start[i]
+    na = values.m0.shape[0] + layout.f_start[i]
+    W, centre = work.W[i], work.centre[i]
+    for c in range(d):
+        G = values.G[g0 + c]
+        centre[c] = values.offset[time, g0 + c]
+        for j in range(na):
+            centre[c] += G[j] * m[j]
+        for k in range(na):
+            total = 0.0
+            for j in range(na):
+                total += P[k, j] * G[j]
+            W[k, c] = total
+    p = work.square
+    for c in range(d):
+        for b in range(c + 1):
+            total = 0.0
+            for j in range(na):
+                total += values.G[g0 + c, j] * W[j, b]
+            p[c, b] = total
+            p[b, c] = total
+    _cholesky(p[:d, :d], work.root[i, :d, :d])
+
+
+@njit(**BORROWING)
+def _node(i, q, layout, work):
+    """Write node q of layer i, centre + L xi_q, to work.z."""
+    xi, z = layout.nodes[i, q], work.z
+    for c in range(layout.channels[i]):
+        z[c] = work.centre[i, c]
+        for b in range(c + 1):
+            z[c] += work.root[i, c, b] * xi[b]
+
+
+@njit(**BORROWING)
+def _average(i, layout, values, mean, block, work):
+    """Write E f, Var f and work.cross = sum w xi f' of static layer i."""
+    d = layout.channels[i]
+    e = layout.outputs[i]
+    f0 = layout.f_start[i]
+    cross = work.cross[i]
+    z, weight4, slope4 = work.z, work.weight4, work.slope4
+    for a in range(e):
+        mean[a] = 0.0
+        for b in range(e):
+            block[a, b] = 0.0
+        for c in range(d):
+            cross[c, a] = 0.0
+    grid = values.table_mean.shape[1]
+    for q in range(layout.node_count[i]):
+        xi = layout.nodes[i, q]
+        wq = layout.node_weight[i, q]
+        _node(i, q, layout, work)
+        f = work.f[i, q]
+        if layout.form[i] == TABLE:
+            k = locate(z[0], values.low[i], values.spacing[i], grid, weight4, slope4)
+            for a in range(e):
+                total = 0.0
+                variance = 0.0
+                for b in range(4):
+                    total += weight4[b] * values.table_mean[f0 + a, k + b]
+                    variance += weight4[b] * values.table_variance[f0 + a, k + b]
+                f[a] = total
+                block[a, a] += wq * variance
+        else:
+            expansion(layout.form[i], z[:d], _expansion(i, layout, values), f[:e])
+        for a in range(e):
+            mean[a] += wq * f[a]
+            for c in range(d):
+                cross[c, a] += wq * xi[c] * f[a]
+    for q in range(layout.node_count[i]):
+        wq = layout.node_weight[i, q]
+        f = work.f[i, q]
+        for a in range(e):
+            for b in range(e):
+                block[a, b] += wq * (f[a] - mean[a]) * (f[b] - mean[b])
+
+
+@njit(**BORROWING)
+def append(i, time, layout, values, m, P, work):
+    """Append the outputs of static layer i to the mean m and covariance P, in place."""
+    d = layout.channels[i]
+    e = layout.outputs[i]
+    na = values.m0.shape[0] + layout.f_start[i]
+    _project(i, time, layout, values, m, P, work)
+    _average(i, layout, values, m[na : na + e], P[na : na + e, na : na + e], work)
+    W, root, gain, cross = work.W[i], work.root[i], work.gain[i], work.cross[i]
+    # gain = L^{-T} cross
+    for a in range(e):
+        for c in range(d - 1, -1, -1):
+            total = cross[c, a]
+            for b in range(c + 1, d):
+                total -= root[b, c] * gain[b, a]
+            gain[c, a] = total / root[c, c]
+        for k in range(na):
+            total = 0.0
+            for c in range(d):
+                total += W[k, c] * gain[c, a]
+            P[k, na + a] = total
+            P[na + a, k] = total
+
+
+@njit(**BORROWING)
+def _gain_adjoint(i, na, layout, P_bar, work):
+    """Gradients by cross, W and root through the regression gain; the others begin at zero."""
+    d = layout.channels[i]
+    e = layout.outputs[i]
+    W, root, gain = work.W[i], work.root[i], work.gain[i]
+    W_bar, root_bar, cross_bar = work.W_bar, work.root_bar, work.cross_bar
+    W_bar[:na, :d] = 0.0
+    root_bar[:d, :d] = 0.0
+    work.centre_bar[:d] = 0.0
+    for a in range(e):
+        for c in range(d):
+            total = 0.0
+            for k in range(na):
+                covariance_bar = 2.0 * P_bar[k, na + a]
+                total += W[k, c] * covariance_bar
+                W_bar[k, c] += covariance_bar * gain[c, a]
+            cross_bar[c, a] = total
+        # cross_bar = L^{-1} gain_bar
+        for c in range(d):
+            total = cross_bar[c, a]
+            for b in range(c):
+                total -= root[c, b] * cross_bar[b, a]
+            cross_bar[c, a] = total / root[c, c]
+    for j in range(d):
+        for k in range(j + 1):
+            for a in range(e):
+                root_bar[j, k] -= gain[j, a] * cross_bar[k, a]
+
+
+@njit(**BORROWING)
+def _average_adjoint(i, layout, values, bars, m, m_bar, P_bar, work):
+    """Reverse of `_average`: gradients by the function, and by centre and root of its input."""
+    d = layout.channels[i]
+    e = layout.outputs[i]
+    f0 = layout.f_start[i]
+    na = values.m0.shape[0] + f0
+    z, z_bar, w4, s4 = work.z, work.z_bar, work.weight4, work.slope4
+    f_bar = work.f_bar[:e]
+    grid = values.table_mean.shape[1]
+    for q in range(layout.node_count[i]):
+        xi = layout.nodes[i, q]
+        wq = layout.node_weight[i, q]
+        f = work.f[i, q]
+        z_bar[:d] = 0.0
+        _node(i, q, layout, work)
+        for a in range(e):
+            total = m_bar[na + a]
+            for c in range(d):
+                total += work.cross_bar[c, a] * xi[c]
+            for b in range(e):
+                total += 2.0 * P_bar[na + a, na + b] * (f[b] - m[na + b])
+            f_bar[a] = wq * total
+        if layout.form[i] == TABLE:
+            k = locate(z[0], values.low[i], values.spacing[i], grid, w4, s4)
+            for a in range(e):
+                v_bar = wq * P_bar[na + a, na + a]
+                for b in range(4):
+                    bars.table_mean[f0 + a, k + b] += f_bar[a] * w4[b]
+                    bars.table_variance[f0 + a, k + b] += v_bar * w4[b]
+                    z_bar[0] += s4[b] * (
+                        f_bar[a] * values.table_mean[f0 + a, k + b]
+                        + v_bar * values.table_variance[f0 + a, k + b]
+                    )
+            # The grid itself may move: f depends on (z - low) / spacing.
+            bars.low[i] -= z_bar[0]
+            bars.spacing[i] -= z_bar[0] * (z[0] - values.low[i]) / values.spacing[i]
+        else:
+            part, part_bar = _expansion(i, layout, values), _expansion(i, layout, bars)
+            expansion_adjoint(layout.form[i], z[:d], part, f_bar, z_bar[:d], part_bar)
+        for c in range(d):
+            work.centre_bar[c] += z_bar[c]
+            for b in range(c + 1):
+                work.root_bar[c, b] += z_bar[c] * xi[b]
+
+
+@njit(**BORROWING)
+def append_adjoint(i, time, layout, values, bars, m, P, m_bar, P_bar, work):
+    """Reverse mode of `append`: m_bar and P_bar (symmetric) lose the layer's outputs, in place."""
+    d = layout.channels[i]
+    g0 = layout.g_start[i]
+    na = values.m0.shape[0] + layout.f_start[i]
+    _gain_adjoint(i, na, layout, P_bar, work)
+    _average_adjoint(i, layout, values, bars, m, m_bar, P_bar, work)
+    W, W_bar, centre_bar, p_bar = work.W[i], work.W_bar, work.centre_bar, work.square
+    _cholesky_adjoint(d, work.root[i], work.root_bar, p_bar)
     # p = G W, centre = G m + offset, W = P G'.
     for c in range(d):
         G = values.G[g0 + c]

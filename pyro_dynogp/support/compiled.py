@@ -14,17 +14,36 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from numba import njit
+
 # Division by zero gives infinity, which callers tell from a covariance.
 OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
+
+
+def accepted(**options: object) -> bool:
+    """Whether this version of numba knows the options; nothing is compiled to find out."""
+    try:
+        from numba.core.compiler import Flags
+
+        njit(lambda: None).targetdescr.options.parse_as_flags(Flags(), options)
+    except (ImportError, AttributeError, KeyError, TypeError):  # unknown, or asked otherwise
+        return False
+    return True
+
+
 # For what allocates nothing and returns no array: the caller holds all arrays, and counting its
-# references would cost more than the arithmetic of one sample.
-BORROWING = {**OPTIONS, "_nrt": False}
+# references would cost more than the arithmetic of one sample. The option is numba's own, so it is
+# left out where numba no longer has it: the results are the same, the recursions slower.
+BORROWING = {**OPTIONS, "_nrt": False} if accepted(_nrt=False) else dict(OPTIONS)
 # The same where an array is returned; the caller's own options rule then.
 INLINED = {**OPTIONS, "inline": "always"}
 
 
-def drop_stale(folder: Path) -> list[Path]:
+def drop_stale(folder: Path, *called: Path) -> list[Path]:
     """Remove kept machine code of a package's folder that is older than one of its sources.
+
+    Args:
+        folder: of the package. called: folders whose compiled functions it calls.
 
     Returns:
         The files removed. Where they may not be removed (an installation that is read only) numba
@@ -33,7 +52,8 @@ def drop_stale(folder: Path) -> list[Path]:
     kept = list((folder / "__pycache__").glob("*.nb[ic]"))
     if not kept:
         return []
-    sources = [*folder.glob("*.py"), Path(__file__)]  # here are the compiler's options
+    sources = [path for f in (folder, *called) for path in f.glob("*.py")]
+    sources.append(Path(__file__))  # here are the compiler's options
     changed = max(source.stat().st_mtime for source in sources)
     removed = []
     for path in kept:
