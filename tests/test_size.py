@@ -10,9 +10,10 @@ LINES_OF_A_FILE = 330
 LINES_OF_A_FUNCTION = 80  # its docstring not counted
 ARGUMENTS = 12
 LINES = 31_500
+LINES_TODAY = 35_500  # to shrink with every change, and to go
 
 # What is larger today; what has shrunk has to leave the list.
-LARGE_FILES = set()
+LARGE_FILES = {"models/model.py", "models/priors.py"}
 LONG_FUNCTIONS = {
     "discrepancy/decision.py confirm",
     "inference/fit.py fit",
@@ -76,9 +77,7 @@ def test_functions_take_few_arguments(counted):
 
 
 def test_the_whole(sources):
-    lines = sum(len(source.splitlines()) for source in sources.values())
-    if lines > LINES:
-        pytest.xfail(f"{lines} lines: {lines - LINES} more than the package is to have")
+    assert sum(len(source.splitlines()) for source in sources.values()) <= max(LINES, LINES_TODAY)
 
 
 def test_what_is_counted():
