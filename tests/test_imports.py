@@ -155,3 +155,19 @@ class TestTheChecksNotice:
         made["other.z"] = f"import {PACKAGE}.low.x"
         found = upward(arrows_of(made), [["top"], ["low", "other"]])
         assert found == {("low.x", "top.y"), ("other.z", "low.x")}
+
+
+def test_the_page_lists_the_rooms_of_the_contract():
+    text = (ROOT / "docs" / "architecture.md").read_text()
+    section = text.split("## The rooms, highest first")[1].split("\n`support`")[0]
+    heads = [item.split(":")[0] for item in section.split("\n- ")[1:]]
+    assert [re.findall(r"`(\w+)`", head) for head in heads] == contract()[0]
+
+
+def test_the_code_of_the_page_runs():
+    (code,) = re.findall(
+        r"```python\n(.*?)```", (ROOT / "docs" / "architecture.md").read_text(), re.S
+    )
+    names = {}
+    exec(code, names)
+    assert names["rational"].denominator.shape[-1] == 3
