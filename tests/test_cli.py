@@ -12,7 +12,8 @@ import pytest
 from click.testing import CliRunner
 
 import pyro_dynogp as dgp
-from pyro_dynogp.cli import demo, main
+from pyro_dynogp.cli import demonstration as demo
+from pyro_dynogp.cli import main
 from pyro_dynogp.cli.data import DATASETS
 from pyro_dynogp.examples import datasets
 
@@ -119,7 +120,7 @@ def test_fit_without_inputs_on_time_stamps(folder, tmp_path):
         "--timezone", "Europe/Vienna", *QUICK, "--figures", tmp_path / "new" / "figures",
     )  # fmt: skip
     assert result.exit_code == 0, result.output
-    assert "inputs=0" in result.stdout
+    assert "0 inputs ->" in result.stdout
     assert "5 figures in" in result.stdout
     assert not (tmp_path / "new" / "figures" / "bode.png").exists()
 

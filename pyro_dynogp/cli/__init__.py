@@ -86,7 +86,7 @@ def demo(directory: Path, quiet: bool) -> None:
       pyro-dynogp demo
       pyro-dynogp demo --output drives
     """  # noqa: D301
-    from pyro_dynogp.cli.demo import run_demo
+    from pyro_dynogp.cli.demonstration import run_demo
 
     run_demo(directory, progress=not quiet)
 
@@ -160,7 +160,7 @@ def fit(
       pyro-dynogp fit gas_furnace --pairs 3 --method svi --figures figures
     """  # noqa: D301
     import pyro_dynogp as dgp
-    from pyro_dynogp.cli import demo as report
+    from pyro_dynogp.cli import demonstration as report
 
     if save is not None:
         _check_folder("--save", save)

@@ -18,7 +18,7 @@ _ARRAYS = ("input_offset", "input_scale", "output_offset", "output_scale")
 _NAMES = ("input_names", "output_names", "input_units", "output_units")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Scaling:
     """Clock and signal scales of the training data, learnt from them alone.
 

@@ -27,7 +27,7 @@ _STUDY = "dynoGP: Deep Gaussian Processes for dynamic system identification"
 _CIRCUIT_FILE = "WH_EstimationExample.csv"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Dataset:
     """A data set with its test protocol.
 
@@ -108,8 +108,8 @@ def _one_of(option: str, value: Any, allowed: tuple[Any, ...]) -> None:
 def _parts(name: str, record: Record, k: int, source: str, skip: int = 0) -> Dataset:
     train, test = record.split(k)
     return Dataset(
-        name, train, test, source,
-        f"Train on the first {k} samples, test on the last {len(test)}.", skip, record,
+        name=name, train=train, test=test, source=source, skip=skip, full=record,
+        protocol=f"Train on the first {k} samples, test on the last {len(test)}.",
     )  # fmt: skip
 
 
@@ -181,7 +181,9 @@ def _vic_elec(test: str = "paper") -> Dataset:
         "way of the R package tsibbledata"
     )
     chosen = second_half if test == "paper" else year_2014
-    return Dataset("vic_elec", train, chosen, source, protocol, full=full)
+    return Dataset(
+        name="vic_elec", train=train, test=chosen, source=source, protocol=protocol, full=full
+    )
 
 
 def _wh_process_noise(test: str = "multisine", path: str | PathLike[str] | None = None) -> Dataset:
@@ -203,10 +205,10 @@ def _wh_process_noise(test: str = "multisine", path: str | PathLike[str] | None 
     )  # fmt: skip
     count = "realisation 0" if isinstance(train, Record) else f"all {len(train)} realisations"
     return Dataset(
-        "wh_process_noise", train, _renamed(recorded),
-        "M. Schoukens and J. P. Noël, Three benchmarks addressing open challenges in nonlinear "
-        "system identification, IFAC-PapersOnLine 50, 2017",
-        f"Train on {count} (process noise), test on the {test} record (no process noise).",
+        name="wh_process_noise", train=train, test=_renamed(recorded),
+        source="M. Schoukens and J. P. Noël, Three benchmarks addressing open challenges in "
+        "nonlinear system identification, IFAC-PapersOnLine 50, 2017",
+        protocol=f"Train on {count} (process noise), test on the {test} record (no process noise).",
     )  # fmt: skip
 
 
@@ -244,9 +246,10 @@ def _renamed(record: Record, u: str = "u", y: str = "y") -> Record:
 def _simulated(name: str, simulator: Callable[..., Simulation], options: dict[str, Any]) -> Dataset:
     run = simulator(**options)
     return Dataset(
-        name, run.train, run.test, f"Simulated by pyro_dynogp, after the study in: {_STUDY}",
-        f"Train on the first {len(run.train)} samples, test on the {len(run.test)} that follow, "
-        "where no process noise acts.",
+        name=name, train=run.train, test=run.test,
+        source=f"Simulated by pyro_dynogp, after the study in: {_STUDY}",
+        protocol=f"Train on the first {len(run.train)} samples, test on the {len(run.test)} that "
+        "follow, where no process noise acts.",
         full=run.full, truth=run.truth,
     )  # fmt: skip
 

@@ -20,7 +20,7 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.support.errors import invalid
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Truth:
     """What is known of a simulated system (float64 throughout).
 
@@ -61,7 +61,7 @@ class Truth:
         return np.linalg.eigvals(self.A).astype(np.complex128)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Simulation:
     """A simulated experiment: training record, test record, and the truth behind them."""
 
@@ -302,4 +302,4 @@ def _experiment(
     for array in vars(truth).values():
         if isinstance(array, np.ndarray):
             array.setflags(write=False)
-    return Simulation(train, test, record, truth)
+    return Simulation(train=train, test=test, full=record, truth=truth)
