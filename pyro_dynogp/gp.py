@@ -12,7 +12,7 @@ from pyro_dynogp.lti.covariance import autocovariance
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import hold, mean_response
 from pyro_dynogp.support.errors import invalid
-from pyro_dynogp.support.tensors import as_tensor
+from pyro_dynogp.support.tensors import Numbers, as_tensor
 
 
 class LTIParameters(gpytorch.Module):
@@ -101,7 +101,12 @@ class LTIMean(gpytorch.means.Mean):
     prediction of `ExactGP`, which appends the test rows to the training rows, carries the state on.
     """
 
-    def __init__(self, system: Modes | LTIParameters, time: Any = None, inputs: Any = None) -> None:
+    def __init__(
+        self,
+        system: Modes | LTIParameters,
+        time: Numbers | None = None,
+        inputs: Numbers | None = None,
+    ) -> None:
         super().__init__()
         self.system = _parameters(system)
         if (time is None) != (inputs is None):

@@ -265,7 +265,7 @@ class Record:
         )
 
     def with_extra_as_input(self, name: str) -> Record:
-        """Return the same record with the extra channel `name` as its last input.
+        """The extra channel as last input, as in ``record.with_extra_as_input("rain")``.
 
         Raises:
             ValueError: there is no such extra channel, or it has gaps.

@@ -9,7 +9,7 @@ trajectory given noisy samples.
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Sequence
 
 import torch
 from pyro.distributions import constraints
@@ -25,13 +25,13 @@ from pyro_dynogp.distributions.trajectory import (
     real_or_missing,
     split_missing,
 )
-from pyro_dynogp.lti.grid import time_grid
+from pyro_dynogp.lti.grid import TimeGrid, time_grid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import Response, as_inputs, mean_response
 from pyro_dynogp.lti.semiseparable import SemiseparableCovariance, jitter_variance
 from pyro_dynogp.lti.state import ModalState
 from pyro_dynogp.support.errors import invalid
-from pyro_dynogp.support.tensors import as_tensor, broadcast
+from pyro_dynogp.support.tensors import Numbers, as_tensor, broadcast
 
 
 class LTIProcess(Trajectory):
@@ -59,12 +59,12 @@ class LTIProcess(Trajectory):
     def __init__(
         self,
         modes: Modes,
-        time: Any,
-        inputs: Any = None,
-        initial_state: Any = None,
+        time: Numbers | TimeGrid,
+        inputs: Numbers | None = None,
+        initial_state: Numbers | ModalState | None = None,
         *,
         jitter: float = 1e-9,
-        offset: Any = None,
+        offset: Numbers | None = None,
         validate_args: bool | None = None,
     ) -> None:
         self.modes = modes
@@ -136,7 +136,7 @@ class LTIProcess(Trajectory):
         v = jitter_variance(self.modes, self.initial_covariance, self.jitter)
         return v.expand((*v.shape[:-1], self._size))
 
-    def observed(self, noise_sd: Any, *, varying: bool = False) -> ObservedLTIProcess:
+    def observed(self, noise_sd: Numbers, *, varying: bool = False) -> ObservedLTIProcess:
         """Trajectory plus white measurement noise, the trajectory integrated out.
 
         Args:
@@ -146,7 +146,9 @@ class LTIProcess(Trajectory):
         """
         return ObservedLTIProcess(self, noise_sd, varying=varying)
 
-    def condition(self, y: Any, noise_sd: Any, *, varying: bool = False) -> ConditionedLTIProcess:
+    def condition(
+        self, y: Numbers, noise_sd: Numbers, *, varying: bool = False
+    ) -> ConditionedLTIProcess:
         """Trajectory given noisy samples y (..., *event); NaN where there is none.
 
         See `ConditionedLTIProcess`; noise_sd and varying as in `observed`.
@@ -168,7 +170,7 @@ class ObservedLTIProcess(Trajectory):
     def __init__(
         self,
         process: LTIProcess,
-        noise_sd: Any,
+        noise_sd: Numbers,
         *,
         varying: bool = False,
         validate_args: bool | None = None,
@@ -201,8 +203,8 @@ class ObservedLTIProcess(Trajectory):
     @property
     def variance(self) -> Tensor:
         """(*batch, *event)."""
-        shape = self.batch_shape + self.event_shape
-        return self.process.variance.expand(shape) + self.noise_variance
+        signal = self.process.variance.expand(self.batch_shape + self.event_shape)
+        return signal + self.noise_variance
 
     def covariance(self, noise_variance: Tensor) -> SemiseparableCovariance:
         """Covariance of the trajectory plus independent noise of the given variance (*b, N)."""
@@ -233,7 +235,7 @@ class ConditionedLTIProcess(Trajectory):
     has_innovations = False
 
     def __init__(
-        self, observed: ObservedLTIProcess, y: Any, *, validate_args: bool | None = None
+        self, observed: ObservedLTIProcess, y: Numbers, *, validate_args: bool | None = None
     ) -> None:
         self.modes = observed.modes
         self.prior = observed.process
@@ -276,8 +278,7 @@ class ConditionedLTIProcess(Trajectory):
     @property
     def mean(self) -> Tensor:
         """Smoothed trajectory E[h | y] (*batch, *event)."""
-        alpha = apply(self.K.solve, self.K, self.residual)
-        update = apply(self.K.signal_matmul, self.K, alpha)
+        update = apply(self.K.signal_matmul, self.K, apply(self.K.solve, self.K, self.residual))
         shape = self.batch_shape + self.event_shape
         return self.prior.mean.expand(shape) + self.from_rows(update).expand(shape)
 
@@ -286,7 +287,7 @@ class ConditionedLTIProcess(Trajectory):
         """Var[h_k | y] (*batch, *event)."""
         return self.from_rows(self.K.signal_variance()).expand(self.batch_shape + self.event_shape)
 
-    def rsample(self, sample_shape: Any = ()) -> Tensor:
+    def rsample(self, sample_shape: Sequence[int] = ()) -> Tensor:
         """Joint draws of the trajectory given y, by Matheron's rule."""
         shape = torch.Size(sample_shape) + self.batch_shape + self.event_shape
         noise = torch.randn(shape, dtype=torch.float64, device=self.modes.poles.device)
@@ -300,15 +301,14 @@ class ConditionedLTIProcess(Trajectory):
         update = apply(K.signal_matmul, K, alpha) + self.prior.noise_rows * alpha
         return h + self.from_rows(update)
 
-    def log_prob(self, value: Any) -> Tensor:
+    def log_prob(self, value: Numbers) -> Tensor:
         """Joint log-density of trajectories: log p(h) + log p(y | h) - log p(y)."""
         value = as_tensor(value, device=self.modes.poles.device)
         if self._validate_args:
             self._validate_sample(value)
         sd = self.observed.noise_variance.sqrt()
-        there = ~torch.isnan(self.y)
-        filled = self.y.masked_fill(~there, 0.0)
-        terms = Normal(value, sd).log_prob(filled) * there
+        missing = torch.isnan(self.y)
+        terms = Normal(value, sd).log_prob(self.y.masked_fill(missing, 0.0)) * ~missing
         likelihood = self.rows(terms).sum(-1)
         return self.prior.log_prob(value) + likelihood - self._evidence(self._jittered)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -13,7 +14,7 @@ from torch import Tensor
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.semiseparable import SemiseparableCovariance
 from pyro_dynogp.support.errors import invalid
-from pyro_dynogp.support.tensors import as_tensor
+from pyro_dynogp.support.tensors import Numbers, as_tensor
 
 
 class _RealOrMissing(constraints.Constraint):
@@ -90,7 +91,7 @@ class Trajectory(TorchDistribution):
             self._root = self.covariance(self.noise_rows)
         return self._root
 
-    def rsample(self, sample_shape: Any = ()) -> Tensor:
+    def rsample(self, sample_shape: Sequence[int] = ()) -> Tensor:
         """Draw whole trajectories in O(n)."""
         shape = torch.Size(sample_shape) + self.batch_shape + self.event_shape
         noise = torch.randn(shape, dtype=torch.float64, device=self.modes.poles.device)
@@ -105,7 +106,7 @@ class Trajectory(TorchDistribution):
         residual = self.rows(value - self.mean)
         return self.from_rows(apply(self.root.root_solve, self.root, residual))
 
-    def log_prob(self, value: Any) -> Tensor:
+    def log_prob(self, value: Numbers) -> Tensor:
         """Joint log-density (*s, *batch) of trajectories (*s, *batch, *event)."""
         value = as_tensor(value, device=self.modes.poles.device)
         if self._validate_args:
@@ -140,7 +141,7 @@ def columns(x: Tensor, batch: int) -> Tensor:
     return x.reshape((math.prod(lead), *x.shape[len(lead) :])).movedim(0, -1)
 
 
-def apply(method: Any, K: SemiseparableCovariance, x: Tensor) -> Tensor:
+def apply(method: Callable[[Tensor], Tensor], K: SemiseparableCovariance, x: Tensor) -> Tensor:
     """Apply a method of K that takes right-hand sides to rows (*s, *b, N)."""
     batch = batch_dims(K)
     lead = x.shape[: x.dim() - 1 - batch]

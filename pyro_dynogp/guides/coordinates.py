@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import pyro
 import pyro.distributions as dist
@@ -51,7 +50,7 @@ def joint_normal(name: str, loc: Tensor, scale: float) -> dist.MultivariateNorma
     return dist.MultivariateNormal(mean, scale_tril=sd.unsqueeze(-1) * unit)
 
 
-def to_support(name: str, prior: Any) -> Transform:
+def to_support(name: str, prior: dist.TorchDistribution) -> Transform:
     """The map from unconstrained coordinates to the support of a site.
 
     Raises:
@@ -68,7 +67,7 @@ def to_support(name: str, prior: Any) -> Transform:
         ) from error
 
 
-def unconstrained(name: str, prior: Any, value: Tensor) -> Tensor:
+def unconstrained(name: str, prior: dist.TorchDistribution, value: Tensor) -> Tensor:
     """Unconstrained coordinates of a value.
 
     Raises:
@@ -91,12 +90,12 @@ def each(support: constraints.Constraint) -> constraints.Constraint:
     return support
 
 
-def is_real(prior: Any) -> bool:
+def is_real(prior: dist.TorchDistribution) -> bool:
     """Whether the support is all real numbers, so that `to_support` is the identity."""
     return isinstance(each(prior.support), type(constraints.real))
 
 
-def middle(prior: Any) -> Tensor:
+def middle(prior: dist.TorchDistribution) -> Tensor:
     """Mean of a distribution, or a median of draws where the mean is not finite or unknown."""
     support = prior.support
     try:

@@ -39,7 +39,7 @@ class Family:
         """Value of the site at which it starts, if one was given."""
         return None
 
-    def started(self, name: str, prior: Any, value: Tensor) -> Family:
+    def started(self, name: str, prior: dist.TorchDistribution, value: Tensor) -> Family:
         """The same family, made to start at a value of the site.
 
         `LayerGuide` calls this once, before there are particles.
@@ -50,7 +50,7 @@ class Family:
         """
         return self
 
-    def posterior(self, name: str, prior: Any) -> Any:
+    def posterior(self, name: str, prior: dist.TorchDistribution) -> dist.TorchDistribution:
         """Distribution of the site in the guide.
 
         Args:
@@ -68,7 +68,7 @@ class Family:
 class SameAsPrior(Family):
     """The site's distribution in the model itself, given what comes before it; no parameters."""
 
-    def posterior(self, name: str, prior: Any) -> Any:
+    def posterior(self, name: str, prior: dist.TorchDistribution) -> dist.TorchDistribution:
         """The prior."""
         return prior
 
@@ -87,14 +87,14 @@ class _Started(Family):
     def _init(self) -> Any:
         return getattr(self, "init", None)
 
-    def started(self, name: str, prior: Any, value: Tensor) -> Family:
+    def started(self, name: str, prior: dist.TorchDistribution, value: Tensor) -> Family:
         """The same family, made to start at a value of the site."""
         return replace(self, at=self._coordinates(name, prior, value))
 
-    def _coordinates(self, name: str, prior: Any, value: Tensor) -> Tensor:
+    def _coordinates(self, name: str, prior: dist.TorchDistribution, value: Tensor) -> Tensor:
         return unconstrained(name, prior, value)
 
-    def _at(self, name: str, prior: Any) -> Tensor:
+    def _at(self, name: str, prior: dist.TorchDistribution) -> Tensor:
         """Where the parameters start; outside a LayerGuide, the family's own value or the prior's.
 
         Such a start has the batch shape of the prior.
@@ -117,7 +117,7 @@ class Point(_Started):
 
     init: Any = None
 
-    def posterior(self, name: str, prior: Any) -> Any:
+    def posterior(self, name: str, prior: dist.TorchDistribution) -> dist.TorchDistribution:
         """Delta at the value."""
         transform = to_support(name, prior)
         point = parameter(
@@ -139,7 +139,7 @@ class MeanField(_Started):
     init_scale: float = 0.05
     init: Any = None
 
-    def posterior(self, name: str, prior: Any) -> Any:
+    def posterior(self, name: str, prior: dist.TorchDistribution) -> dist.TorchDistribution:
         """A normal, transformed where the support is not all real numbers."""
         if not self.init_scale > 0:
             raise invalid("init_scale", expected="a number > 0", got=repr(self.init_scale))
@@ -173,7 +173,7 @@ class FullRank(_Started):
     init_scale: float = 0.05
     init: Any = None
 
-    def posterior(self, name: str, prior: Any) -> Any:
+    def posterior(self, name: str, prior: dist.TorchDistribution) -> dist.TorchDistribution:
         """A multivariate normal, reshaped, and transformed where the support needs it."""
         transform = to_support(name, prior)
         first = self._at(name, prior)
@@ -210,7 +210,7 @@ class GaussMarkov(_Started):
     def _init(self) -> Any:
         return self.init_mean
 
-    def posterior(self, name: str, prior: Any) -> Any:
+    def posterior(self, name: str, prior: dist.TorchDistribution) -> dist.TorchDistribution:
         """The prior, conditioned."""
         require_process("GaussMarkov", name, prior)
 
@@ -246,14 +246,14 @@ class InducingTimes(_Started):
     init_scale: float = 0.1
     init: Any = None
 
-    def _coordinates(self, name: str, prior: Any, value: Tensor) -> Tensor:
+    def _coordinates(self, name: str, prior: dist.TorchDistribution, value: Tensor) -> Tensor:
         require_process("InducingTimes", name, prior)
         index = inducing_times(prior.grid, self.count, self.seed)
         size = self.count * prior.modes.outputs
         standard = torch.eye(size, dtype=torch.float64)
         return InducingLTIProcess(prior, index, standard[0], standard).whiten(value)
 
-    def posterior(self, name: str, prior: Any) -> Any:
+    def posterior(self, name: str, prior: dist.TorchDistribution) -> dist.TorchDistribution:
         """The variational distribution of the trajectory."""
         require_process("InducingTimes", name, prior)
         index = inducing_times(prior.grid, self.count, self.seed)
@@ -261,12 +261,12 @@ class InducingTimes(_Started):
         return InducingLTIProcess(prior, index, normal.loc, normal.scale_tril)
 
 
-def default_family(name: str, prior: Any) -> Family:
+def default_family(name: str, prior: dist.TorchDistribution) -> Family:
     """What a site without a family gets: Gauss-Markov if it is a trajectory, else mean field."""
     return GaussMarkov() if isinstance(prior, LTIProcess) else MeanField()
 
 
-def require_process(family: str, name: str, prior: Any) -> None:
+def require_process(family: str, name: str, prior: dist.TorchDistribution) -> None:
     """Refuse a site that is not a trajectory.
 
     Raises:

@@ -157,14 +157,14 @@ class LayerGuide:
         self.observed |= {n for n, s in sites.items() if s["is_observed"]}
         self._ready = True
 
-    def _is_joint(self, name: str, prior: Any) -> bool:
+    def _is_joint(self, name: str, prior: dist.TorchDistribution) -> bool:
         if name in self.given:
             return False
         if isinstance(self.joint, bool):
             return self.joint and not isinstance(prior, LTIProcess)
         return bool(self.joint(name, prior)) if callable(self.joint) else name in self.joint
 
-    def _choose(self, name: str, prior: Any) -> Family:
+    def _choose(self, name: str, prior: dist.TorchDistribution) -> Family:
         family = self.given.get(name)
         if family is None:
             default = self.default
@@ -173,7 +173,7 @@ class LayerGuide:
             raise invalid(f"family of site '{name}'", expected="a Family", got=repr(family))
         return family
 
-    def _first(self, name: str, prior: Any, own: Tensor | None) -> Tensor:
+    def _first(self, name: str, prior: dist.TorchDistribution, own: Tensor | None) -> Tensor:
         value = self.values.get(name) if own is None else own
         standard = middle(prior)
         if value is None:
@@ -214,7 +214,7 @@ class LayerGuide:
             pyro.sample(JOINT, normal, infer={"is_auxiliary": True})
         self.model(*args, **kwargs)
 
-    def posterior(self, name: str, prior: Any, joint: Tensor | None) -> Any:
+    def posterior(self, name: str, prior: dist.TorchDistribution, joint: Tensor | None) -> Any:
         """Posterior of one site, given the joint vector (*particles, d)."""
         part = self._parts.get(name)
         if part is not None and joint is not None:
@@ -287,7 +287,7 @@ def _started(family: Family, name: str, site: Any) -> Family:
     return replace(cast(Any, family), at=at.detach())
 
 
-def _placed(name: str, prior: Any, part: _Part, joint: Tensor) -> dist.Delta:
+def _placed(name: str, prior: dist.TorchDistribution, part: _Part, joint: Tensor) -> dist.Delta:
     """The site's value, computed from its part of the joint vector (*particles, d)."""
     transform = to_support(name, prior)
     ones = torch.Size([1] * transform.domain.event_dim)

@@ -7,19 +7,22 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from pyro_dynogp.lti.covariance import autocovariance, state_covariance
-from pyro_dynogp.lti.grid import time_grid
+from pyro_dynogp.lti.grid import TimeGrid, time_grid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.semiseparable import observability
+from pyro_dynogp.support.tensors import Numbers
 
 
 def signal_covariance(
-    modes: Modes, time: Any, other: Any, initial_covariance: Tensor | None = None
+    modes: Modes,
+    time: Numbers | TimeGrid,
+    other: Numbers | TimeGrid,
+    initial_covariance: Tensor | None = None,
 ) -> Tensor:
     """S(time, other) (*b, n n_y, m n_y), rows ordered by time, the outputs of a time together."""
     t, s = time_grid(time).time, time_grid(other).time
@@ -46,7 +49,7 @@ class DenseCovariance:
     def __init__(
         self,
         modes: Modes,
-        time: Any,
+        time: Numbers | TimeGrid,
         noise_variance: Tensor | float = 0.0,
         initial_covariance: Tensor | None = None,
     ) -> None:
@@ -116,7 +119,7 @@ class DenseCovariance:
         """K X."""
         return self.matrix @ X
 
-    def cross_matmul(self, time: Any, X: Tensor) -> Tensor:
+    def cross_matmul(self, time: Numbers | TimeGrid, X: Tensor) -> Tensor:
         """S(T*, T) X for other times T*."""
         return signal_covariance(self.modes, time, self.grid, self.initial_covariance) @ X
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from pyro_dynogp.support.errors import invalid
-from pyro_dynogp.support.tensors import as_tensor
+from pyro_dynogp.support.tensors import Numbers, as_tensor
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ class TimeGrid:
         return step.reshape(-1), out
 
 
-def time_grid(time: Any) -> TimeGrid:
+def time_grid(time: Numbers | TimeGrid) -> TimeGrid:
     """Prepare sampling times.
 
     Args:

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.support.errors import invalid
-from pyro_dynogp.support.tensors import as_tensor, broadcast
+from pyro_dynogp.support.tensors import Numbers, as_tensor, broadcast
 
 NoiseStructure = Literal["shared", "independent"]
 
@@ -133,7 +133,7 @@ class Modes:
         object.__setattr__(self, "_batch", torch.Size(batch))
 
     @staticmethod
-    def _gain(name: str, value: Any, poles: Tensor) -> Tensor:
+    def _gain(name: str, value: Numbers | None, poles: Tensor) -> Tensor:
         P = poles.shape[-1]
         if value is None:
             return torch.zeros(P, 0, dtype=torch.complex128, device=poles.device)

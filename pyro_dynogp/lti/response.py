@@ -23,7 +23,7 @@ from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.primitives import array, flatten_batch, run
 from pyro_dynogp.support.compiled import OPTIONS
 from pyro_dynogp.support.errors import invalid
-from pyro_dynogp.support.tensors import as_tensor
+from pyro_dynogp.support.tensors import Numbers, as_tensor
 
 
 @njit(**OPTIONS)
@@ -135,7 +135,10 @@ class Response:
 
 
 def mean_response(
-    modes: Modes, time: Any, inputs: Any = None, initial_state: Tensor | None = None
+    modes: Modes,
+    time: Numbers | TimeGrid,
+    inputs: Numbers | None = None,
+    initial_state: Tensor | None = None,
 ) -> Response:
     """Response to inputs that are held constant from each sample to the next.
 
@@ -177,7 +180,7 @@ def mean_response(
     )
 
 
-def held_states(modes: Modes, time: Any, inputs: Any) -> np.ndarray:
+def held_states(modes: Modes, time: Numbers | TimeGrid, inputs: Numbers | None) -> np.ndarray:
     """Modal states (n, P), complex, from zero at the first time; no batches, no gradient."""
     grid = time_grid(time)
     u = as_inputs(modes, grid, inputs)
@@ -191,7 +194,7 @@ def held_states(modes: Modes, time: Any, inputs: Any) -> np.ndarray:
     return states[0]
 
 
-def as_inputs(modes: Modes, grid: TimeGrid, inputs: Any) -> Tensor:
+def as_inputs(modes: Modes, grid: TimeGrid, inputs: Numbers | None) -> Tensor:
     """Inputs as a tensor (*b, n, n_u), checked against the system and the time axis."""
     n, n_u = len(grid), modes.inputs
     device = modes.poles.device
@@ -223,7 +226,7 @@ def as_inputs(modes: Modes, grid: TimeGrid, inputs: Any) -> Tensor:
     return u
 
 
-def hold(time: Any, inputs: Tensor, at: Tensor) -> Tensor:
+def hold(time: Numbers | TimeGrid, inputs: Tensor, at: Tensor) -> Tensor:
     """Zero-order hold: the inputs (*b, m, n_u) that act at times `at` (m,), all >= time[0]."""
     t = time_grid(time).time
     index = torch.searchsorted(t.contiguous(), at.contiguous(), right=True) - 1

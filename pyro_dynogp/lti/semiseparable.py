@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,10 +23,10 @@ from pyro_dynogp.lti.covariance import (
     stationary_variance,
 )
 from pyro_dynogp.lti.fused import output_rows, propagators
-from pyro_dynogp.lti.grid import time_grid
+from pyro_dynogp.lti.grid import TimeGrid, time_grid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.support.errors import invalid
-from pyro_dynogp.support.tensors import as_tensor
+from pyro_dynogp.support.tensors import Numbers, as_tensor
 
 
 class NotPositiveDefiniteError(ValueError):
@@ -51,7 +50,7 @@ class SemiseparableCovariance:
     def __init__(
         self,
         modes: Modes,
-        time: Any,
+        time: Numbers | TimeGrid,
         noise_variance: Tensor | float = 0.0,
         initial_covariance: Tensor | None = None,
     ) -> None:
@@ -190,7 +189,7 @@ class SemiseparableCovariance:
         self._refuse_missing("matmul")
         return self.signal_matmul(X) + self.noise_variance.unsqueeze(-1) * X
 
-    def cross_matmul(self, time: Any, X: Tensor) -> Tensor:
+    def cross_matmul(self, time: Numbers | TimeGrid, X: Tensor) -> Tensor:
         """S(T*, T) X (*b, N*, R) for other times T* (never decreasing)."""
         other = time_grid(time).time
         if self.initial_covariance is not None and bool(other[0] < self.grid.time[0]):

@@ -12,7 +12,7 @@ from pyro_dynogp.lti.covariance import complex_expm1, state_covariance, step_noi
 from pyro_dynogp.lti.fused import propagators
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.state import real_propagator
-from pyro_dynogp.support.tensors import as_tensor
+from pyro_dynogp.support.tensors import Numbers, as_tensor
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def transfer_function(modes: Modes) -> TransferFunction:
     return TransferFunction(padded + feed, denominator)
 
 
-def frequency_response(modes: Modes, omega: Any) -> Tensor:
+def frequency_response(modes: Modes, omega: Numbers) -> Tensor:
     """G(i omega) (*b, m, n_y, n_u), complex, at angular frequencies omega (m,) [rad/s]."""
     s = 1j * as_tensor(omega, device=modes.poles.device)
     lam = modes.poles.unsqueeze(-2)
@@ -151,7 +151,7 @@ def frequency_response(modes: Modes, omega: Any) -> Tensor:
     return direct @ B + mirrored @ B.conj() + modes.D.unsqueeze(-3)
 
 
-def impulse_response(modes: Modes, time: Any) -> Tensor:
+def impulse_response(modes: Modes, time: Numbers) -> Tensor:
     """Response (*b, m, n_y, n_u) [output/(input s)] to a unit impulse at 0, without D delta(t).
 
     time (m,) [s] is the time since the impulse; the response is zero before it.
@@ -162,7 +162,7 @@ def impulse_response(modes: Modes, time: Any) -> Tensor:
     return torch.where((t < 0)[:, None, None], torch.zeros_like(h), h)
 
 
-def step_response(modes: Modes, time: Any) -> Tensor:
+def step_response(modes: Modes, time: Numbers) -> Tensor:
     """Response (*b, m, n_y, n_u) [output/input] to a unit step at 0; time (m,) [s] since it."""
     t = as_tensor(time, device=modes.poles.device)
     lam = modes.poles.unsqueeze(-2)

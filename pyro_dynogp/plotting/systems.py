@@ -12,6 +12,7 @@ from matplotlib.ticker import MultipleLocator
 from pyro_dynogp.lti import views
 from pyro_dynogp.plotting import style
 from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.tensors import Numbers
 
 if TYPE_CHECKING:
     from pyro_dynogp.inference.fitted import Fit
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 DAMPING_LINES = (0.05, 0.1, 0.2, 0.4, 0.7)
 
 
-def impulse_response(fit: Fit, time: Any = None) -> Figure:
+def impulse_response(fit: Fit, time: Numbers | None = None) -> Figure:
     """Response of each output to a unit impulse of each input, with credible bands.
 
     The bands hold 50 and 95 % of the posterior draws at each time by itself. The impulse that the
@@ -70,7 +71,7 @@ def impulse_response(fit: Fit, time: Any = None) -> Figure:
     return figure
 
 
-def bode(fit: Fit, omega: Any = None) -> Figure:
+def bode(fit: Fit, omega: Numbers | None = None) -> Figure:
     """Magnitude and phase of the transfer function from each input to each output, with bands.
 
     The bands hold 50 and 95 % of the posterior draws at each frequency by itself. The phase is
@@ -232,7 +233,7 @@ def _check_inputs(fit: Fit) -> None:
         )
 
 
-def _row(argument: str, values: Any) -> np.ndarray:
+def _row(argument: str, values: Numbers) -> np.ndarray:
     row = np.asarray(values, dtype=np.float64)
     if row.ndim != 1 or len(row) < 2 or not np.isfinite(row).all():
         raise invalid(

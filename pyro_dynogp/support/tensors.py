@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
+
+# What users may give as numbers: a tensor, an array, a list, one number.
+Numbers = Tensor | ArrayLike
 
 
 def broadcast(*shapes: Iterable[int]) -> torch.Size:
@@ -30,7 +33,7 @@ def broadcast(*shapes: Iterable[int]) -> torch.Size:
 
 
 def as_tensor(
-    value: Any, dtype: torch.dtype = torch.float64, device: torch.device | None = None
+    value: Numbers, dtype: torch.dtype = torch.float64, device: torch.device | None = None
 ) -> Tensor:
     """Tensor of the given dtype; read-only arrays (those of a Record) are copied."""
     if isinstance(value, Tensor):
