@@ -82,6 +82,17 @@ def width(layout, values):
 
 
 @njit(**OPTIONS)
+def before_data(values, A):
+    """Mean (A,) and covariance (A, A) of [x; f] at the first sample, nothing appended yet."""
+    N = values.m0.shape[0]
+    m = np.zeros(A)
+    P = np.zeros((A, A))
+    m[:N] = values.m0
+    P[:N, :N] = values.P0
+    return m, P
+
+
+@njit(**OPTIONS)
 def run(layout, values):
     """Log-density of a record, the state before each segment's first sample, and the last one.
 
@@ -93,10 +104,7 @@ def run(layout, values):
     segments = (n + SEGMENT - 1) // SEGMENT
     means = np.empty((segments, N))
     covariances = np.empty((segments, N, N))
-    m = np.zeros(A)
-    P = np.zeros((A, A))
-    m[:N] = values.m0
-    P[:N, :N] = values.P0
+    m, P = before_data(values, A)
     work = workspace(layout, values)
     T = np.empty((N, A))
     c = np.empty(A)

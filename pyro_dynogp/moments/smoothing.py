@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 
 from pyro_dynogp.lti.arithmetic import SEGMENT, dot, times
-from pyro_dynogp.moments.filtering import enter, inner, measure, output_terms, seen
+from pyro_dynogp.moments.filtering import before_data, enter, inner, measure, output_terms, seen
 from pyro_dynogp.moments.layout import FLOOR, workspace
 from pyro_dynogp.moments.measured_function import function_moments, function_terms
 from pyro_dynogp.moments.noise import noise_terms
@@ -60,6 +60,15 @@ def _predict(time, o, layout, values, centre, p, work, found):
     found[2] = np.nan if math.isnan(y) else l
 
 
+@njit(**BORROWING)
+def _predict_all(time, layout, values, m, P, c, work, found):
+    """What `_predict` writes, of all outputs of a sample, to found (3, n, n_y)."""
+    for o in range(values.y.shape[1]):
+        h = seen(o, layout, values)
+        p = _quadratic(P, h, c)
+        _predict(time, o, layout, values, dot(h, m), p, work, found[:, time, o])
+
+
 @njit(**OPTIONS)
 def predict_ahead(layout, values, horizon):
     """Of outputs given data up to `horizon` before: mean, variance, log-density (n, n_y).
@@ -74,10 +83,7 @@ def predict_ahead(layout, values, horizon):
     A = values.G.shape[1]
     S = inner(layout)
     found = np.empty((3, n, n_y))
-    m = np.zeros(A)
-    P = np.zeros((A, A))
-    m[:N] = values.m0
-    P[:N, :N] = values.P0
+    m, P = before_data(values, A)
     ahead_m = m.copy()
     ahead_P = P.copy()
     work = workspace(layout, values)
@@ -90,10 +96,7 @@ def predict_ahead(layout, values, horizon):
             enter(target, layout, values, ahead_m, ahead_P, T)
         for i in range(S):
             append(i, target, layout, values, ahead_m, ahead_P, work)
-        for o in range(n_y):
-            h = seen(o, layout, values)
-            p = _quadratic(ahead_P, h, c)
-            _predict(target, o, layout, values, dot(h, ahead_m), p, work, found[:, target, o])
+        _predict_all(target, layout, values, ahead_m, ahead_P, c, work, found)
     for time in range(n - horizon):
         if time > 0:
             enter(time, layout, values, m, P, T)
@@ -107,10 +110,7 @@ def predict_ahead(layout, values, horizon):
             for i in range(S):
                 append(i, target, layout, values, ahead_m, ahead_P, work)
         target = time + horizon
-        for o in range(n_y):
-            h = seen(o, layout, values)
-            p = _quadratic(ahead_P, h, c)
-            _predict(target, o, layout, values, dot(h, ahead_m), p, work, found[:, target, o])
+        _predict_all(target, layout, values, ahead_m, ahead_P, c, work, found)
     return found[0], found[1], found[2]
 
 
@@ -259,10 +259,7 @@ def innovate(layout, values):
     N = values.m0.shape[0]
     A = values.G.shape[1]
     found = np.full((3, n, n_y), np.nan)
-    m = np.zeros(A)
-    P = np.zeros((A, A))
-    m[:N] = values.m0
-    P[:N, :N] = values.P0
+    m, P = before_data(values, A)
     work = workspace(layout, values)
     T = np.empty((N, A))
     c = np.empty(A)
