@@ -10,18 +10,12 @@ import numpy as np
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.data_faults import Fault, faults, without_stuck
+from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
 from pyro_dynogp.prediction.records import gap_between, joined
 from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
     from pyro_dynogp.inference.fitted import Fit
-
-# Fewest samples of the blocks B and C, and fewest of them that were measured.
-FEWEST, MEASURED = 60, 30
-# Shares of A and B where a record is cut anew.
-SHARES = (0.5, 0.25)
-# Stretches of B where it is shared between fit and search.
-STRETCHES = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +38,9 @@ class Blocks:
     faults: tuple[Fault, ...]
 
 
-def blocks_of(fit: Fit, record: Record, candidates: Record | None) -> Blocks:
+def blocks_of(
+    fit: Fit, record: Record, candidates: Record | None, settings: LoopSettings = DEFAULTS
+) -> Blocks:
     """Cut the data in time.
 
     Where the record goes on after the training record, A is the training record and what follows
@@ -55,6 +51,7 @@ def blocks_of(fit: Fit, record: Record, candidates: Record | None) -> Blocks:
         ValueError: where the fit has several training records, the record has other outputs or a
             clock that does not compare, or too few samples are left or were measured.
     """
+    fewest = settings.block_samples
     if len(fit.records) != 1:
         raise invalid(
             "fit", expected="one training record", got=f"{len(fit.records)}",
@@ -79,7 +76,7 @@ def blocks_of(fit: Fit, record: Record, candidates: Record | None) -> Blocks:
             got="samples before the training record",
             advice="Cut them off: record[k:].",
         )
-    if len(record) - after >= 2 * FEWEST:
+    if len(record) - after >= 2 * fewest:
         if after == 0:  # later data alone: the training record comes before them
             record = _joined(with_candidates(training, None), record, shift)
             after = len(training)
@@ -87,24 +84,24 @@ def blocks_of(fit: Fit, record: Record, candidates: Record | None) -> Blocks:
         second = cut + (len(record) - cut) // 2
     elif len(record) - after == 0 or after > 0:
         record = record[:after] if after else record
-        cut, refit = int(SHARES[0] * len(record)), True
-        second = cut + int(SHARES[1] * len(record))
+        cut, refit = int(settings.fit_share * len(record)), True
+        second = cut + int(settings.search_share * len(record))
     else:
         cut = second = 0
         refit = False
-    if min(cut, second - cut, len(record) - second) < FEWEST:
+    if min(cut, second - cut, len(record) - second) < fewest:
         raise invalid(
-            "record", expected=f"at least {2 * FEWEST} samples after the training record, or "
-            f"{4 * FEWEST} of it", got=f"{len(record)} samples, {after} of them for training",
+            "record", expected=f"at least {2 * fewest} samples after the training record, or "
+            f"{4 * fewest} of it", got=f"{len(record)} samples, {after} of them for training",
         )  # fmt: skip
     found = faults(record, list(record.extra))
     cleared = without_stuck(record, found)
     for part, name in ((cleared[cut:second], "searched"), (cleared[second:], "reported on")):
         measured = int((~part.missing).sum(0).min())
-        if measured < MEASURED:
+        if measured < settings.measured_samples:
             raise invalid(
-                "record", expected=f"{MEASURED} samples or more of each output that were measured "
-                f"in the part to be {name}", got=f"{measured} of {len(part)}",
+                "record", expected=f"{settings.measured_samples} samples or more of each output "
+                f"that were measured in the part to be {name}", got=f"{measured} of {len(part)}",
                 advice="Give a record that goes on for longer.",
             )  # fmt: skip
     refit = refit or not _same(cleared[:cut], record[:cut])
@@ -117,13 +114,13 @@ def blocks_of(fit: Fit, record: Record, candidates: Record | None) -> Blocks:
     return Blocks(cleared[:second], held_out, cleared[second:], refit, sentence, tuple(found))
 
 
-def shared(held_out: np.ndarray) -> np.ndarray:
+def shared(held_out: np.ndarray, stretches: int = DEFAULTS.stretches) -> np.ndarray:
     """Every other stretch of the block that is searched (n,), the last one among them.
 
     The rest of it is for the fit, where something happens that only that block shows.
     """
     rows = np.flatnonzero(held_out)
-    number = np.arange(len(rows)) * STRETCHES // len(rows)
+    number = np.arange(len(rows)) * stretches // len(rows)
     out = np.zeros_like(held_out)
     out[rows[number % 2 == 1]] = True
     return out

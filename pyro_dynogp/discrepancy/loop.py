@@ -4,20 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.blocks import blocks_of
+from pyro_dynogp.discrepancy.context import SearchContext, Stopwatch
 from pyro_dynogp.discrepancy.refits import poles_of, quick_fit
 from pyro_dynogp.discrepancy.report import Report
 from pyro_dynogp.discrepancy.reporting import report_of
-from pyro_dynogp.discrepancy.rounds import Rounds, Stopwatch
-from pyro_dynogp.discrepancy.state import Course
+from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
+from pyro_dynogp.discrepancy.state import SearchState
 from pyro_dynogp.discrepancy.trials import without
 from pyro_dynogp.effects import CATALOGUE, Effect
 from pyro_dynogp.inference.fit import fit as fit_model
-from pyro_dynogp.inference.fitted import Method
+from pyro_dynogp.inference.refit import family_of
 from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
+from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.variants import used_channels
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.parallel import one_thread, parallel_map
@@ -40,6 +42,7 @@ def close_loop(
     level: float = 0.05,
     tries: int = 8,
     effects: Sequence[Effect] = CATALOGUE,
+    settings: LoopSettings = DEFAULTS,
     workers: int | None = None,
     progress: bool = True,
 ) -> Report:
@@ -48,17 +51,17 @@ def close_loop(
     Block A is what the model is fitted to, B is held out for the search, C is opened once, at the
     end. Where process noise certainly costs forecasts of B it hides what is missing: the search
     begins without it, and it comes back as soon as it costs nothing, or where nothing can be added
-    without it (`Course`). A round first asks whether there is any structure in the residuals at all
-    (an omnibus test, or a false discovery rate of one effect, at half of `level` each); if so,
-    effects whose test rejects at `level`, and their nearest relatives, are added to the model one
-    at a time and fitted to A; the one that raises the log-density of held-out data most is kept if
-    it does so by more than two block standard errors and 4 nats (or, as outliers make both large,
-    with no sample counted for more than 10 nats), effects between inputs and output before those of
-    the noise, which their lack imitates. Of effects that explain as much the one that leaves least
-    open is kept, and the others are reported as ties, and so is a cause that the catalogue lacks,
-    where products of inputs or responses that change with time explain far more. Rounds end where
-    nothing is left, or nothing helps. An effect that no block mends (feedback) is among the
-    report's effects, after those that were added.
+    without it (`SearchState`). A round first asks whether there is any structure in the residuals
+    at all (an omnibus test, or a false discovery rate of one effect, at half of `level` each); if
+    so, effects whose test rejects at `level`, and their nearest relatives, are added to the model
+    one at a time and fitted to A; the one that raises the log-density of held-out data most is kept
+    if it does so by more than two block standard errors and 4 nats (or, as outliers make both
+    large, with no sample counted for more than 10 nats), effects between inputs and output before
+    those of the noise, which their lack imitates. Of effects that explain as much the one that
+    leaves least open is kept, and the others are reported as ties, and so is a cause that the
+    catalogue lacks, where products of inputs or responses that change with time explain far more.
+    Rounds end where nothing is left, or nothing helps. An effect that no block mends (feedback) is
+    among the report's effects, after those that were added.
 
     Args:
         fit: a fit to one record.
@@ -68,6 +71,7 @@ def close_loop(
         seed: the same seed gives the same report. max_rounds: most effects that are added.
         level: of the tests. tries: most effects that are refitted in a round.
         effects: what is looked for, `CATALOGUE` and your own.
+        settings: every other threshold.
         workers: processes; None for all processors, or the cluster of
             ``joblib.parallel_config``. progress: whether to show progress bars.
 
@@ -80,15 +84,15 @@ def close_loop(
         raise invalid("level", expected="a number between 0 and 1", got=repr(level))
     watch = Stopwatch()
     other = candidates if isinstance(candidates, Record) else None
-    data = blocks_of(fit, record, other)
+    data = blocks_of(fit, record, other, settings)
     names = _names(fit, data.known, candidates)
     # As far up as its extensions will get: what a better climb gains is no effect.
     first = quick_fit(
         fit.model, without(data.known, data.held_out), seed, None if data.refit else fit.at_mode(),
         poles=poles_of(fit),
     )  # fmt: skip
-    rounds = Rounds(data, names, seed, level, tries, effects, workers, progress)
-    course = Course(rounds, watch, first)
+    rounds = SearchContext(data, names, seed, level, tries, effects, workers, progress, settings)
+    course = SearchState(rounds, watch, first)
     watch.stop("fit of block A")
     while course.go_round():
         if len(course.accepted) == max_rounds:  # whether something is left is still to be said
@@ -101,7 +105,7 @@ def close_loop(
     fits = [first, course.current] if course.accepted else [first]
     # The same samples for both, so that they can be compared.
     known = where_inputs_are_known(data.known, longest_delay(course.model))
-    fitted = _final(fits, known, workers, progress)
+    fitted = _final(fits, fit, known, workers, progress)
     watch.stop("last fits")
     return report_of(fitted[0], fitted[-1], course, warnings)
 
@@ -124,19 +128,35 @@ def _names(fit: Fit, record: Record, candidates: Sequence[str] | Record | None) 
     return sorted(set(names) - used_channels(fit.model))
 
 
-def _final(fits: Sequence[Fit], record: Record, workers: int | None, progress: bool) -> list[Fit]:
+def _final(
+    fits: Sequence[Fit], given: Fit, record: Record, workers: int | None, progress: bool
+) -> list[Fit]:
     """Models of block A fitted to A and B, from what they have learnt and from fresh starts.
 
-    Refits of the search are posterior modes; here the posterior of static functions is wanted.
+    Refits of the search are posterior modes; here the posterior is of the kind that the given fit
+    has, and at least that of static functions is wanted.
     """
 
-    def one(given: Fit) -> Fit:
-        model = replace(given.model, scaling=None)
-        method: Method = "svi" if model.has_function or given.method != "map" else "map"
+    def refitted(found: Fit) -> Fit:
+        model = replace(found.model, scaling=None)
         restarts = LAST_LINEAR_STARTS if model.is_linear else LAST_CASCADE_STARTS
         return fit_model(
-            model, record, method=method, start=given, restarts=restarts, seed=given.seed,
-            workers=1, progress=False,
+            model, record, start=found, restarts=restarts, seed=found.seed, workers=1,
+            progress=False, **_method_of(given, model),
         )  # fmt: skip
 
-    return parallel_map(one, fits, workers=workers, progress=progress, description="last fits")
+    return parallel_map(refitted, fits, workers=workers, progress=progress, description="last fits")
+
+
+def _method_of(given: Fit, model: Model) -> dict[str, Any]:
+    """Options of `fit` with which a model gets a posterior of the kind that a fit has."""
+    count = len(next(iter(given.draws.values())))
+    if given.method == "nuts":
+        chains = int(given.diagnostics["chains"])
+        return {"method": "nuts", "chains": chains, "draws": count // chains}
+    if given.method == "svi":
+        options: dict[str, Any] = {"method": "svi", "draws": count}
+        if model.has_function == given.model.has_function and given.collapsed:
+            options["hyperparameters"] = family_of(given)
+        return options
+    return {"method": "svi" if model.has_function else "map"}

@@ -9,12 +9,13 @@ import numpy as np
 
 from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.discrepancy.context import SearchContext
 from pyro_dynogp.discrepancy.decision import Confirmed
 from pyro_dynogp.discrepancy.parameters import limits_of, parameters_of
 from pyro_dynogp.discrepancy.report import FoundEffect, Report
-from pyro_dynogp.discrepancy.rounds import Rounds
 from pyro_dynogp.discrepancy.search import Found
-from pyro_dynogp.discrepancy.state import Course
+from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
+from pyro_dynogp.discrepancy.state import SearchState
 from pyro_dynogp.discrepancy.trials import one_step_density
 from pyro_dynogp.effects import Effect
 from pyro_dynogp.prediction.records import joined
@@ -26,13 +27,10 @@ from pyro_dynogp.support.parallel import parallel_map
 if TYPE_CHECKING:
     from pyro_dynogp.inference.fitted import Fit
 
-# Scores that rise by less do not speak against what was added: effects of the noise change them
-# by chance.
-SLACK = 1.05
 SCORES = ("rmse", "mae", "nrmse", "crps", "coverage_50", "coverage_95")
 
 
-def report_of(base: Fit, extended: Fit, course: Course, warnings: Sequence[str]) -> Report:
+def report_of(base: Fit, extended: Fit, course: SearchState, warnings: Sequence[str]) -> Report:
     """Open block C, once.
 
     Args:
@@ -53,7 +51,9 @@ def report_of(base: Fit, extended: Fit, course: Course, warnings: Sequence[str])
     there = np.isfinite(densities[0])
     gain = densities[1][there] - densities[0][there]
     elpd_gain, elpd_gain_error = float(gain.sum()), block_standard_error(gain)[0]
-    unpaid = does_not_pay(before, after, elpd_gain, elpd_gain_error) if accepted else []
+    unpaid: list[str] = []
+    if accepted:
+        unpaid = does_not_pay(before, after, elpd_gain, elpd_gain_error, rounds.settings)
     watch.stop("scores of the last block")
     tests = _tested([f for f, _ in accepted], (base, extended), whole, sealed, rounds)
     watch.stop("residual tests of the last block")
@@ -84,7 +84,11 @@ def report_of(base: Fit, extended: Fit, course: Course, warnings: Sequence[str])
 
 
 def does_not_pay(
-    before: Mapping[str, float], after: Mapping[str, float], gain: float, error: float
+    before: Mapping[str, float],
+    after: Mapping[str, float],
+    gain: float,
+    error: float,
+    settings: LoopSettings = DEFAULTS,
 ) -> list[str]:
     """A warning where forecasts of the last block are worse by both scores, or clearly less likely.
 
@@ -92,8 +96,8 @@ def does_not_pay(
         before, after: scores of the forecasts [output].
         gain, error: in log density, with its block standard error [nats].
     """
-    worse = all(after[name] > SLACK * before[name] for name in ("rmse", "crps"))
-    if not worse and gain > -2.0 * error:
+    worse = all(after[name] > settings.worse * before[name] for name in ("rmse", "crps"))
+    if not worse and gain > -settings.worse_errors * error:
         return []
     scores = ", ".join(
         f"{name.upper()} {before[name]:.3g} -> {after[name]:.3g}" for name in ("rmse", "crps")
@@ -112,7 +116,11 @@ def _outcome(added: bool, left: bool) -> str:
 
 
 def _tested(
-    found: Sequence[Found], fits: Sequence[Fit], whole: Record, sealed: np.ndarray, rounds: Rounds
+    found: Sequence[Found],
+    fits: Sequence[Fit],
+    whole: Record,
+    sealed: np.ndarray,
+    rounds: SearchContext,
 ) -> dict[str, tuple[float, float]]:
     """Smallest p-value of each effect's tests on C, of the model before and after."""
     effects = list({f.effect.name: f.effect for f in found}.values())

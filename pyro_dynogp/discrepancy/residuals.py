@@ -10,6 +10,7 @@ import numpy as np
 from pyro_dynogp.criticism.posterior_draws import draws_of, with_draws
 from pyro_dynogp.data.channels import count_direct
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
 from pyro_dynogp.models.delays import longest_delay, unknown_beginning
 from pyro_dynogp.models.limits import at_limits
 from pyro_dynogp.statistics.evidence import Residuals
@@ -17,11 +18,6 @@ from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
     from pyro_dynogp.inference.fitted import Fit
-
-# Time constants until a simulation has settled, and the share of a record that may be lost to it.
-SETTLED, LOST = 4.0, 0.1
-# Posterior draws that say what the uncertainty of the parameters leaves in a residual.
-DRAWS = 48
 
 
 def residuals_of(
@@ -32,6 +28,7 @@ def residuals_of(
     candidates: Sequence[str] = (),
     output: int = 0,
     seed: int = 0,
+    settings: LoopSettings = DEFAULTS,
 ) -> Residuals:
     """Simulation residuals and innovations of one output, in the units of the record.
 
@@ -42,7 +39,7 @@ def residuals_of(
         fit: the fit. record: along which, in one piece.
         held_out: (n,) True where the fit has not seen the output; by default everywhere.
         candidates: names of extra channels that may act.
-        output: which one. seed: of posterior draws.
+        output: which one. seed: of posterior draws. settings: thresholds.
 
     Raises:
         ValueError: where a candidate is no extra channel of the record.
@@ -54,19 +51,21 @@ def residuals_of(
             )
     prepared = fit.model.check(record)[0]
     if fit.method == "map":
-        drawn = draws_of(fit, count=DRAWS, seed=seed, anneal=False)
+        drawn = draws_of(fit, count=settings.draws, seed=seed, anneal=False)
         spread = with_draws(fit, drawn.values)
     else:
         spread = fit
     options = {} if fit.model.is_linear else {"process_noise": False}
     mean = fit.simulate(prepared, seed=seed, **options).mean[:, output]
-    component = spread.simulate(prepared, seed=seed, samples=DRAWS, **options).component_mean
-    chosen = np.linspace(0, len(component) - 1, min(DRAWS, len(component))).astype(int)
+    component = spread.simulate(
+        prepared, seed=seed, samples=settings.draws, **options
+    ).component_mean
+    chosen = np.linspace(0, len(component) - 1, min(settings.draws, len(component))).astype(int)
     deviations = component[chosen][:, :, output]
     driving = prepared.n_inputs - count_direct(fit.model.channels)
     y = record.outputs[:, output].copy()
     unknown = unknown_beginning(record, longest_delay(fit.model))
-    y[: unknown + settling(fit, record)] = np.nan
+    y[: unknown + settling(fit, record, settings)] = np.nan
     innovations = fit.innovations(prepared)[:, output]
     # A sensor at its limit says nothing of the error there.
     stopped = at_limits(fit.model.layers, prepared)
@@ -89,11 +88,11 @@ def residuals_of(
     )
 
 
-def settling(fit: Fit, record: Record) -> int:
+def settling(fit: Fit, record: Record, settings: LoopSettings = DEFAULTS) -> int:
     """Samples until what the first state left in a simulation has died away."""
     modes = [layer.modes for _, layer in fit.system_at(fit.mode).dynamic]
     if not modes:
         return 0
     slowest = min(float(-one.poles.real.max()) for one in modes)
-    count = SETTLED / max(slowest * record.sampling_time, 1e-9)
-    return int(min(count, LOST * len(record)))
+    count = settings.settled / max(slowest * record.sampling_time, 1e-9)
+    return int(min(count, settings.settling_share * len(record)))

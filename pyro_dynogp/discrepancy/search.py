@@ -6,15 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import false_discovery_control
 
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
 from pyro_dynogp.effects import Effect
 from pyro_dynogp.models.variants import Model
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
 from pyro_dynogp.support.parallel import parallel_map
-
-# Least probable evidence of an effect that is tried because a relative's test rejects.
-RELATIVE = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,26 +81,21 @@ def look(
 
 def rated(found: Sequence[tuple[Effect, Evidence]]) -> list[Found]:
     """With false discovery rates, most probable effects first."""
-    q = false_discovery_rates(np.array([one.p_value for _, one in found]))
+    if not found:
+        return []
+    p = np.clip([one.p_value for _, one in found], 0.0, 1.0)
+    q = false_discovery_control(p, method="by")  # Benjamini & Yekutieli (2001)
     both = [Found(effect, one, float(v)) for (effect, one), v in zip(found, q, strict=True)]
     return sorted(both, key=lambda f: (f.evidence.p_value, -f.evidence.gain))
 
 
-def false_discovery_rates(p_values: np.ndarray) -> np.ndarray:
-    """Adjusted p-values (m,) of Benjamini and Yekutieli (2001)."""
-    m = len(p_values)
-    if not m:
-        return p_values
-    order = np.argsort(p_values)
-    harmonic = np.sum(1.0 / np.arange(1, m + 1))
-    scaled = p_values[order] * m * harmonic / np.arange(1, m + 1)
-    q = np.empty(m)
-    q[order] = np.minimum(1.0, np.minimum.accumulate(scaled[::-1])[::-1])
-    return q
-
-
 def candidates_of(
-    found: Sequence[Found], model: Model, record: Record, level: float, tries: int
+    found: Sequence[Found],
+    model: Model,
+    record: Record,
+    level: float,
+    tries: int,
+    settings: LoopSettings = DEFAULTS,
 ) -> list[Candidate]:
     """The most probable effects that can be added, best first.
 
@@ -116,7 +110,7 @@ def candidates_of(
     made: dict[str, set[str]] = {}
     for one in found:
         p = one.evidence.p_value
-        relative = one.effect.family in families and p <= RELATIVE
+        relative = one.effect.family in families and p <= settings.relative
         if (p > level and not relative) or len(out) >= tries:
             continue
         known = made.setdefault(one.effect.name, set())

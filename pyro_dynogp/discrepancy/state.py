@@ -7,11 +7,11 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.discrepancy.context import SearchContext, Stopwatch, Tested, goes_with_inputs
 from pyro_dynogp.discrepancy.data_faults import data_spikes
 from pyro_dynogp.discrepancy.decision import Confirmed
 from pyro_dynogp.discrepancy.refits import quick_fit
 from pyro_dynogp.discrepancy.report import Attempt
-from pyro_dynogp.discrepancy.rounds import Looked, Rounds, Stopwatch, goes_with_inputs
 from pyro_dynogp.discrepancy.search import Candidate, Found, candidates_of
 from pyro_dynogp.discrepancy.trials import without
 from pyro_dynogp.effects import ProcessNoise
@@ -27,7 +27,7 @@ OTHERS = "others are more probable, or no block of the model stands for it"
 
 
 @dataclass(eq=False)
-class Course:
+class SearchState:
     """What rounds have come to.
 
     Where process noise hides what is missing, rounds begin without it. It comes back as soon as it
@@ -47,7 +47,7 @@ class Course:
         left: what is left, in words, by the last tests. notes: what else there is to say.
     """
 
-    rounds: Rounds
+    rounds: SearchContext
     watch: Stopwatch
     first: Fit
     plain: Fit = field(init=False)
@@ -63,7 +63,7 @@ class Course:
     reported: list[Found] = field(default_factory=list)
     left: tuple[str, ...] = ()
     notes: list[str] = field(default_factory=list)
-    _looked: Looked | None = None
+    _looked: Tested | None = None
 
     def __post_init__(self) -> None:
         self.plain = self.rounds.plain(self.first)
@@ -83,7 +83,9 @@ class Course:
         chosen: list[Candidate] = []
         if self.left:
             open_loop = [f for f in looked.found if not self._is_fed_back(f)]
-            chosen = candidates_of(open_loop, self.model, known, rounds.level, rounds.tries)
+            chosen = candidates_of(
+                open_loop, self.model, known, rounds.level, rounds.tries, rounds.settings
+            )
         self.attempts += self._untried(looked.found, chosen)
         if chosen:
             confirmed = rounds.confirm(chosen, self.current, self.number)
@@ -98,7 +100,7 @@ class Course:
         self.waiting, self.returned = set(), True
         return True
 
-    def look(self) -> Looked:
+    def look(self) -> Tested:
         """Test the residuals of the model so far."""
         known = self.waiting | {one.effect.name for one, _ in self.accepted}
         # A function of the output that is there has its limits, too.
@@ -174,7 +176,7 @@ class Course:
             attempts.append(attempt)
         return attempts
 
-    def _add(self, winner: Found, confirmed: Confirmed, larger: Model, looked: Looked) -> None:
+    def _add(self, winner: Found, confirmed: Confirmed, larger: Model, looked: Tested) -> None:
         """Go on with the model that a winner extends."""
         rounds = self.rounds
         if rounds.doubtful(winner, looked.whole, rounds.beyond(looked.residuals)):

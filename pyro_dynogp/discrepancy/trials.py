@@ -13,22 +13,16 @@ from scipy.special import logsumexp
 from pyro_dynogp.criticism.densities import pointwise_log_density
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.refits import energy, poles_of, quick_fit, race
+from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
 from pyro_dynogp.inference.fitted import Fit
 from pyro_dynogp.models.delays import comparable
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.variants import Model
 from pyro_dynogp.prediction.first_state import beginning
 
-# Blocks of a record on which effects of one instant are scored, every other one at a time.
-BLOCKS = 12
 Score = Literal["one step", "forecast"]
 # Data on which variants of an effect are compared.
 Compared = Literal["training", "held out"]
-# Differences of held-out log-densities that count are larger [nats].
-NATS = 4.0
-# How often the best variant is refined, and how much longer than the longest delay of the first
-# variants one of them may come to be.
-REFINEMENTS, REACH = 2, 1.3
 
 
 @dataclass(frozen=True)
@@ -46,6 +40,7 @@ class Trial:
         score: what densities are of, see `held_out_density`.
         compared: on which data variants are, see `Effect`.
         fit: of a single model to the first fold's training data, where there is one already.
+        settings: thresholds.
     """
 
     models: tuple[Model, ...]
@@ -57,6 +52,7 @@ class Trial:
     refine: Callable[[Model, Record, int], Sequence[Model]] | None = None
     compared: Compared = "training"
     fit: Fit | None = None
+    settings: LoopSettings = DEFAULTS
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,12 +114,12 @@ def _kept(trial: Trial, training: Record) -> Fit:
     (model, *others), start = trial.models, base
     finer = _finer(trial, model, training, 0)
     if others or finer:
-        same = comparable(training, [*trial.models, *finer], REACH)
+        same = comparable(training, [*trial.models, *finer], trial.settings.reach)
         found, problems = race(trial.models, same, base, trial.seed)
         if not found:
             raise ValueError(problems[0])
         start = found[0]
-        for times in range(REFINEMENTS):
+        for times in range(trial.settings.refinements):
             finer = _finer(trial, _unscaled(start), training, times)
             start = min([start, *race(finer, same, start, trial.seed)[0]], key=energy)
         model = _unscaled(start)
@@ -139,7 +135,8 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
     """The first variant that does as well as the best on the data held out."""
     fits = [quick_fit(model, training, trial.seed, trial.base) for model in trial.models]
     sums = [held_out_density(f, trial.record, trial.folds[0], trial.score).sum() for f in fits]
-    return next(f for f, total in zip(fits, sums, strict=True) if total >= max(sums) - NATS)
+    least = max(sums) - trial.settings.gain
+    return next(f for f, total in zip(fits, sums, strict=True) if total >= least)
 
 
 def _unscaled(fit: Fit) -> Model:
@@ -216,10 +213,10 @@ def stretches(mask: np.ndarray) -> list[slice]:
     return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def interleaved(count: int) -> tuple[np.ndarray, ...]:
+def interleaved(count: int, blocks: int = DEFAULTS.folds) -> tuple[np.ndarray, ...]:
     """Two folds (n,): every other block of a record, and those between but for the first.
 
     What happens at one instant has data on either side of it in both.
     """
-    number = np.arange(count) * BLOCKS // max(count, 1)
+    number = np.arange(count) * blocks // max(count, 1)
     return (number % 2 == 1), ((number % 2 == 0) & (number > 0))

@@ -78,7 +78,7 @@ def refit(fit: Fit, records: Record | Sequence[Record]) -> Fit:
     if fit.method == "nuts":
         draws = _sampled(fit, target, argument, best)
         return replace(fit, draws=MappingProxyType(draws), **changed)
-    family = _family(fit)
+    family = family_of(fit)
     found = posterior_of(
         target,
         argument,
@@ -112,7 +112,7 @@ def optima_of(fit: Fit) -> list[Mapping[str, Tensor]]:
     return found
 
 
-def _family(fit: Fit) -> Hyperparameters:
+def family_of(fit: Fit) -> Hyperparameters:
     """What `fit` was told about hyperparameters."""
     if isinstance(fit.posterior, MixtureGuide):
         return "map"

@@ -220,7 +220,7 @@ def history(fit: Fit) -> Figure:
         style.title(panel, f"begins at {values[0]:.4g}, off the axis")
     name = "evidence lower bound" if noisy else "-log p(outputs, parameters)"
     style.label(panel, x="iteration [-]", y=f"{name} [nats]")
-    style.title(figure, "Course of the optimisation")
+    style.title(figure, "SearchState of the optimisation")
     style.legend(figure)
     return figure
 

@@ -16,6 +16,7 @@ from pyro_dynogp.discrepancy.decision import Confirmed, certain, confirm
 from pyro_dynogp.discrepancy.refits import quick_fit
 from pyro_dynogp.discrepancy.residuals import residuals_of
 from pyro_dynogp.discrepancy.search import Found, look, rated
+from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
 from pyro_dynogp.discrepancy.trials import forecast_density, forecast_errors, without
 from pyro_dynogp.effects import ClockShift, Effect
 from pyro_dynogp.models.variants import (
@@ -31,10 +32,6 @@ if TYPE_CHECKING:
 
 # Families of effects that go with inputs.
 OF_INPUTS = ("paths", "shapes")
-# An effect is doubtful where what no effect of the catalogue does gains so many times as much, and
-# the effect is not seen beside it. (Where the effect is what was missing that gains at most as
-# much, as products of an input resemble its square, and nothing once it is added.)
-FAR = 2.0
 
 
 def goes_with_inputs(effect: Effect) -> bool:
@@ -58,7 +55,7 @@ class Stopwatch:
 
 
 @dataclass(frozen=True, eq=False)
-class Looked:
+class Tested:
     """What a round sees.
 
     Attributes:
@@ -74,12 +71,12 @@ class Looked:
 
 
 @dataclass(eq=False)
-class Rounds:
+class SearchContext:
     """One after the other on the same data, with the same options.
 
     Attributes:
         data: blocks. names: of candidate channels.
-        seed, level, tries, effects, workers, progress: as of `close_loop`.
+        seed, level, tries, effects, workers, progress, settings: as of `close_loop`.
         held_out: (n,) samples of the known blocks that no fit of a round sees.
     """
 
@@ -91,6 +88,7 @@ class Rounds:
     effects: Sequence[Effect]
     workers: int | None
     progress: bool
+    settings: LoopSettings = DEFAULTS
     held_out: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
@@ -99,18 +97,26 @@ class Rounds:
     @property
     def gate(self) -> float:
         """Level of each of the two answers to whether anything is left: that of both, halved."""
-        return self.level / 2.0
+        return self.level * self.settings.gate
 
     def residuals(self, fit: Fit, record: Record, held_out: np.ndarray) -> list[Residuals]:
         """Of every output, with the candidates that the model does not use."""
         taken = used_channels(fit.model)
         free = [name for name in self.names if name not in taken]
         return [
-            residuals_of(fit, record, held_out=held_out, candidates=free, output=a, seed=self.seed)
+            residuals_of(
+                fit,
+                record,
+                held_out=held_out,
+                candidates=free,
+                output=a,
+                seed=self.seed,
+                settings=self.settings,
+            )
             for a in range(record.n_outputs)
         ]
 
-    def look(self, fit: Fit, known: Collection[str], plain: Fit | None = None) -> Looked:
+    def look(self, fit: Fit, known: Collection[str], plain: Fit | None = None) -> Tested:
         """Residuals, and evidence of all effects but those that are known.
 
         What goes with inputs is looked for in all known data, and in what the model leaves without
@@ -139,7 +145,7 @@ class Rounds:
             )
             found += [(one.effect, one.evidence) for one in seen]
             notes += skipped
-        return Looked(residuals, whole, rated(found), notes)
+        return Tested(residuals, whole, rated(found), notes)
 
     def plain(self, fit: Fit) -> Fit:
         """Fit without process noise, to the same data; the fit itself where it has none."""
@@ -162,7 +168,7 @@ class Rounds:
             errors.append(error)
             densities.append(forecast_density(error, sd))
         gain = (densities[1] - densities[0])[~record.missing[held_out]]
-        if not certain(gain):
+        if not certain(gain, self.settings):
             return ""
         before, after = (np.sqrt(np.nanmean(error**2, axis=0)) for error in errors)
         rmse = "; ".join(
@@ -184,7 +190,8 @@ class Rounds:
         """Refit what is chosen in a round, and judge it."""
         return confirm(
             chosen, current, self.data.known, self.held_out, number=number,
-            seed=self.seed, level=self.level, workers=self.workers, progress=self.progress,
+            seed=self.seed, level=self.level, settings=self.settings, workers=self.workers,
+            progress=self.progress,
         )  # fmt: skip
 
     def beyond(self, residuals: Sequence[Residuals]) -> list[Beyond]:
@@ -204,11 +211,14 @@ class Rounds:
     ) -> bool:
         """Whether what no effect of the catalogue does explains far more, and what the effect does.
 
+        Where the effect is what was missing that gains at most as much, as products of an input
+        resemble its square, and nothing once it is added.
+
         Args:
             winner: the effect. residuals: of every output, of the model without it.
             beyond: of each output.
         """
-        if max(one.gain for one in beyond) <= FAR * winner.evidence.gain:
+        if max(one.gain for one in beyond) <= self.settings.outside * winner.evidence.gain:
             return False
         if winner.effect.score == "one step":  # innovations do not tell what would be left
             return True
@@ -229,10 +239,10 @@ class Rounds:
         begin = self.data.known.time[int(np.argmax(self.held_out))]
         if float(winner.evidence.where.get("time", -np.inf)) < begin:
             return False
-        self.held_out = shared(self.held_out)
+        self.held_out = shared(self.held_out, self.settings.stretches)
         return True
 
-    def left(self, looked: Looked) -> tuple[str, ...]:
+    def left(self, looked: Tested) -> tuple[str, ...]:
         """What is left, in words: empty where nothing is.
 
         By the tests of single effects, all paid for, or else by the omnibus test.

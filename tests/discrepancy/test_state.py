@@ -11,10 +11,10 @@ from scipy.signal import lfilter
 import pyro_dynogp as dgp
 from pyro_dynogp import effects
 from pyro_dynogp.discrepancy.blocks import blocks_of
+from pyro_dynogp.discrepancy.context import SearchContext, Tested
 from pyro_dynogp.discrepancy.refits import quick_fit
-from pyro_dynogp.discrepancy.rounds import Looked, Rounds
 from pyro_dynogp.discrepancy.search import Found
-from pyro_dynogp.discrepancy.state import Course
+from pyro_dynogp.discrepancy.state import SearchState
 from pyro_dynogp.discrepancy.trials import without
 from pyro_dynogp.models.variants import has_process_noise, without_process_noise
 from pyro_dynogp.statistics.evidence import Evidence
@@ -42,7 +42,7 @@ def test_process_noise_that_costs_forecasts_is_pointed_out(late, noise, hides):
     fit = dgp.fit(MODEL, record[:240], restarts=2, workers=1, progress=False)
     data = blocks_of(fit, record, None)
     training = without(data.known, data.held_out)
-    rounds = Rounds(data, [], 0, 0.05, 8, (effects.LevelShift(),), 1, False)
+    rounds = SearchContext(data, [], 0, 0.05, 8, (effects.LevelShift(),), 1, False)
     given = quick_fit(MODEL, training, 0, fit)
     said = rounds.hiding(given, rounds.plain(given))
     assert bool(said) == hides, said
@@ -60,7 +60,7 @@ def test_a_fit_without_process_noise_hides_nothing(rounds):
 def rounds():
     record = oscillator(0, 0.0, seed=2)
     fit = dgp.fit(MODEL, record[:240], restarts=1, workers=1, progress=False)
-    return Rounds(blocks_of(fit, record, None), [], 0, 0.05, 8, (), 1, False)
+    return SearchContext(blocks_of(fit, record, None), [], 0, 0.05, 8, (), 1, False)
 
 
 def test_what_is_left_is_said(rounds):
@@ -71,12 +71,12 @@ def test_what_is_left_is_said(rounds):
         Found(effects.LevelShift(), Evidence("level shift", 1.0, q / 4, 3.0, 0.1), q)
         for q in (0.03, 0.02)
     ]
-    assert rounds.left(Looked([quiet], [quiet], [], [])) == ()
-    assert rounds.left(Looked([quiet], [quiet], found[:1], [])) == ()  # half of the level is 0.025
-    assert "level shift (0.02)" in rounds.left(Looked([quiet], [quiet], found, []))[0]
+    assert rounds.left(Tested([quiet], [quiet], [], [])) == ()
+    assert rounds.left(Tested([quiet], [quiet], found[:1], [])) == ()  # half of the level is 0.025
+    assert "level shift (0.02)" in rounds.left(Tested([quiet], [quiet], found, []))[0]
     better = Found(effects.LevelShift(), Evidence("level shift", 1.0, 1e-3, 3.0, 0.1), 4e-3)
-    assert "level shift (0.004)" in rounds.left(Looked([quiet], [quiet], [better, *found], []))[0]
-    (said,) = rounds.left(Looked([quiet], [product], [], []))
+    assert "level shift (0.004)" in rounds.left(Tested([quiet], [quiet], [better, *found], []))[0]
+    (said,) = rounds.left(Tested([quiet], [product], [], []))
     assert "products of inputs" in said
 
 
@@ -157,7 +157,9 @@ class OnlyBesideNoise(effects.LevelShift):
 def test_where_nothing_can_be_added_without_process_noise_the_search_begins_again_with_it(
     monkeypatch, effect, said
 ):
-    monkeypatch.setattr(Rounds, "hiding", lambda self, fit, plain: "" if fit is plain else "hides")
+    monkeypatch.setattr(
+        SearchContext, "hiding", lambda self, fit, plain: "" if fit is plain else "hides"
+    )
     record = oscillator(0, 0.3, seed=3)
     y = record.outputs[:, 0] + 2.0 * (np.arange(N) >= 270)
     record = record.with_outputs(y)
@@ -189,7 +191,7 @@ def test_what_goes_with_inputs_under_feedback_is_not_tried(effect, p, certain, f
         return Found(effect, Evidence(effect.name, 5.0, p, 1.0, 0.1), 10.0 * p)
 
     course = SimpleNamespace(reported=[found(effects.Feedback(), one) for one in certain])
-    assert Course._is_fed_back(course, found(effect, p)) == fed_back
+    assert SearchState._is_fed_back(course, found(effect, p)) == fed_back
 
 
 @pytest.mark.parametrize(
@@ -211,8 +213,8 @@ def test_what_was_done_about_noise_that_hides_is_said(noise, accepted, returned,
         hidden="forecasts better", first=first, current=current, accepted=accepted,
         returned=returned,
     )  # fmt: skip
-    (sentence,) = Course.said_of_hiding(course)
+    (sentence,) = SearchState.said_of_hiding(course)
     assert sentence.startswith("The model as given forecasts better")
     assert said in sentence
     course.hidden = ""
-    assert Course.said_of_hiding(course) == []
+    assert SearchState.said_of_hiding(course) == []
