@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 from scipy.special import logsumexp
@@ -13,6 +12,7 @@ from scipy.special import logsumexp
 from pyro_dynogp.criticism.densities import pointwise_log_density
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.refits import energy, poles_of, quick_fit, race
+from pyro_dynogp.effects.base import Compared, Score
 from pyro_dynogp.inference.fitted import Fit
 from pyro_dynogp.models.delays import comparable
 from pyro_dynogp.models.outputs import output_process
@@ -21,9 +21,6 @@ from pyro_dynogp.prediction.first_state import beginning
 
 # Blocks of a record on which effects of one instant are scored, every other one at a time.
 BLOCKS = 12
-Score = Literal["one step", "forecast"]
-# Data on which variants of an effect are compared.
-Compared = Literal["training", "held out"]
 # Differences of held-out log-densities that count are larger [nats].
 NATS = 4.0
 # How often the best variant is refined, and how much longer than the longest delay of the first

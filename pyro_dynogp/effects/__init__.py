@@ -15,27 +15,23 @@ such a class and give it to `close_loop` among `effects`:
 """
 
 from pyro_dynogp.effects.base import Effect
-from pyro_dynogp.effects.noise import (
-    Feedback,
-    HeavyTails,
-    HeteroscedasticNoise,
-    ProcessNoise,
-)
-from pyro_dynogp.effects.paths import DeadTime, ExtraInput, UnmodelledDynamics
-from pyro_dynogp.effects.shapes import (
-    DeadZoneOfInput,
-    Hysteresis,
-    InputNonlinearity,
-    OutputNonlinearity,
-    Saturation,
-)
-from pyro_dynogp.effects.times import (
-    CalendarEffect,
-    ClockShift,
-    Drift,
-    LevelShift,
-    PeriodicDisturbance,
-)
+from pyro_dynogp.effects.calendar import CalendarEffect
+from pyro_dynogp.effects.clock_shift import ClockShift
+from pyro_dynogp.effects.dead_time import DeadTime
+from pyro_dynogp.effects.dead_zone import DeadZoneOfInput
+from pyro_dynogp.effects.drift import Drift
+from pyro_dynogp.effects.dynamics import UnmodelledDynamics
+from pyro_dynogp.effects.extra_input import ExtraInput
+from pyro_dynogp.effects.feedback import Feedback
+from pyro_dynogp.effects.heavy_tails import HeavyTails
+from pyro_dynogp.effects.heteroscedastic import HeteroscedasticNoise
+from pyro_dynogp.effects.hysteresis import Hysteresis
+from pyro_dynogp.effects.input_nonlinearity import InputNonlinearity
+from pyro_dynogp.effects.level_shift import LevelShift
+from pyro_dynogp.effects.output_nonlinearity import OutputNonlinearity
+from pyro_dynogp.effects.periodic import PeriodicDisturbance
+from pyro_dynogp.effects.process_noise import ProcessNoise
+from pyro_dynogp.effects.saturation import Saturation
 
 __all__ = ["CATALOGUE", "Effect"]
 

@@ -3,65 +3,50 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 
+from pyro_dynogp.data.channels import ShiftedClock
+from pyro_dynogp.data.channels.clock import DAY
+from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.signals import shifted
-from pyro_dynogp.effects.clocks import all_zones, clock_shares, in_zone
+from pyro_dynogp.effects.base import (
+    Effect,
+    changed,
+    listed,
+    number_of,
+    set_last,
+    unit_of,
+)
+from pyro_dynogp.effects.clock_shift_score import refined_shift, score_of_shifts, shifts_of
+from pyro_dynogp.effects.clocks import ZONES, all_zones, clock_shares, in_zone
+from pyro_dynogp.models.variants import (
+    Model,
+    with_channel,
+)
 from pyro_dynogp.statistics.bootstrap import (
-    Prepare,
-    Score,
-    log_ratio,
-    projector,
     replicates,
     sieve,
-    solved,
     spanning,
 )
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
 from pyro_dynogp.statistics.shares_of_inputs import check_inputs
-from pyro_dynogp.statistics.time_pictures import instant, over_time
-from pyro_dynogp.statistics.whitening import Whitener
+from pyro_dynogp.statistics.time_pictures import in_words, instant, over_time
 from pyro_dynogp.support.errors import invalid
 
-# Shifts that are tried [steps], both ways; and one hour where there are stamps.
-SHIFTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 # Shifts of the whole record, which are none of the clock's, together with their sums [steps].
 WHOLE = (-4, -2, -1, 0, 1, 2, 4)
-# Instants of change on the first pass, and the share of the record kept on either side.
-INSTANTS, END = 60, 0.05
+
 # Channels of the largest share that are tried.
 CHANNELS = 6
+
 # A rule has no instant to choose: it wins unless another instant is this much better [nats]; so
 # do summers beside winters.
 PREFERENCE = 3.0
 
-
-@dataclass(frozen=True, eq=False)
-class Shifts:
-    """All shifts of all channels.
-
-    Attributes:
-        changes: (n, J) what each shift adds to the mean where it holds [output].
-        shifts: (J,) [time unit]. channels: (J,) index of a share.
-        edges: (I,) samples at which a shift may begin, to last to the end.
-        parts: (P, n) where rules of daylight saving have their hour, or do not have it.
-    """
-
-    changes: np.ndarray
-    shifts: np.ndarray
-    channels: np.ndarray
-    edges: np.ndarray
-    parts: np.ndarray
-
-    def effect(self, variant: int) -> np.ndarray:
-        """What a variant adds to the mean (n,): first all parts, then all edges."""
-        place, j = divmod(variant, self.changes.shape[1])
-        if place < len(self.parts):
-            return self.parts[place] * self.changes[:, j]
-        at = self.edges[place - len(self.parts)]
-        return np.where(np.arange(len(self.changes)) >= at, self.changes[:, j], 0.0)
+# Samples by which the instant of a shifted clock is moved to refine it, first and then.
+FARTHEST = ((7, 14, 21, 28, 35), (1, 2, 3))
 
 
 def clock_shift(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 0) -> Evidence:
@@ -98,7 +83,7 @@ def clock_shift(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 
     if not names:
         raise invalid("residuals", expected="an input that acts on the mean", got="none")
     rules, parts = _rules(r, zones)
-    tried = _tried(r, shares, parts)
+    tried = shifts_of(r, shares, parts)
     # A shift of the whole record is a dead time, and a wrong gain is not a matter of clocks.
     everywhere = [shifted(s, r.time, k * r.step) for s in shares.T for k in WHOLE]
     nuisance = spanning(np.column_stack([r.mean, *everywhere]))
@@ -106,7 +91,7 @@ def clock_shift(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 
     count = tried.changes.shape[1] * (len(parts) + len(tried.edges))
     found = sieve(
         r.residual,
-        _score(tried, nuisance, missing),
+        score_of_shifts(tried, nuisance, missing),
         np.ones(count),
         deviations=r.deviations,
         replicates=replicates(len(r), 2 * nuisance.shape[1] + tried.changes.shape[1]),
@@ -130,7 +115,9 @@ def clock_shift(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 
         when = f"in the {where['season']} of {where['rule']}"
     else:
         first = int(tried.edges[place - len(parts)])
-        at, shift, effect = _refined(r, found.whitener, nuisance, share, first, shift, tried.edges)
+        at, shift, effect = refined_shift(
+            r, found.whitener, nuisance, share, first, shift, tried.edges
+        )
         when = f"from {instant(r, at)}"
     where |= {"shift": shift, "time": float(r.time[at]), "time_unit": r.time_unit}
     if r.stamps is not None:
@@ -172,103 +159,94 @@ def _rules(r: Residuals, zones: Sequence[str]) -> tuple[list[tuple[str, str]], n
     )
 
 
-def _tried(r: Residuals, shares: np.ndarray, parts: np.ndarray) -> Shifts:
-    n = len(r)
-    lengths = {float(k) * r.step for k in SHIFTS if k <= n // 10}
-    if r.stamps is not None:
-        seconds = (r.stamps[-1] - r.stamps[0]).total_seconds() / (r.time[-1] - r.time[0])
-        hour = 3600.0 / seconds
-        # A whole number of steps up to rounding is that number, and tried once.
-        steps = round(hour / r.step, 6)
-        if 0.25 <= steps <= n // 10:
-            lengths.add(steps * r.step)
-    shifts = np.array([sign * d for d in sorted(lengths) for sign in (1.0, -1.0)])
-    changes = [shifted(s, r.time, -d) - s for s in shares.T for d in shifts]
-    low, high = max(int(END * n), 5), n - max(int(END * n), 5)
-    edges = np.unique(np.linspace(low, high, min(INSTANTS, high - low)).astype(int))
-    return Shifts(
-        changes=np.column_stack(changes),
-        shifts=np.tile(shifts, shares.shape[1]),
-        channels=np.repeat(np.arange(shares.shape[1]), len(shifts)),
-        edges=edges,
-        parts=parts,
-    )
+class ClockShift(Effect):
+    """An input whose clock is off in part of the record.
 
-
-def _score(tried: Shifts, nuisance: np.ndarray, missing: np.ndarray) -> Prepare:
-    """Score of all shifts from all edges, by sums over what lies between two edges.
-
-    At an edge the whitened effect differs from the part of the whitened change for as many samples
-    as the filter has coefficients; that is left out.
+    Args:
+        zones: IANA zones whose daylight saving may be what shifts it, for records with stamps.
     """
 
-    def prepare(whiten: Whitener) -> Score:
-        there, Q, R = projector(whiten, nuisance, missing)
-        rows = np.flatnonzero(there) + whiten.order
-        w = whiten(tried.changes)[there]
-        starts = np.searchsorted(rows, tried.edges)
-        masks = tried.parts[:, rows]
-        ends = [*starts[1:], len(rows)]
-        blocks = [slice(a, b) for a, b in zip(starts, ends, strict=True)]
+    name = "clock shift"
+    family = "time"
+    localised = True
 
-        def against(values: np.ndarray) -> np.ndarray:
-            """Products of w with values (m, ...) over each place: rules, then edges to the end."""
-            later = np.cumsum([w[b].T @ values[b] for b in blocks][::-1], axis=0)[::-1]
-            ruled = [w.T @ (values.T * m).T for m in masks]
-            return np.concatenate([np.array(ruled).reshape(-1, *later.shape[1:]), later])
+    @property
+    def mimicked_by_feedback(self) -> bool:
+        """It is about inputs, though it is looked for in the held-out residual."""
+        return True
 
-        squares = np.square(w)
-        later = np.concatenate([np.cumsum(squares[::-1], axis=0)[::-1], 0.0 * squares[:1]])[starts]
-        beside = against(Q)
-        norm = np.concatenate([masks @ squares, later]) - np.square(beside).sum(2)
+    def __init__(self, zones: Sequence[str] = ZONES) -> None:
+        self.zones = tuple(zones)
 
-        def score(x: np.ndarray):
-            e0 = whiten(x)[there]
-            q = Q.T @ e0
-            e = e0 - Q @ q
-            explained = np.maximum(2.0 * against(e) - norm, 0.0).ravel()
-            gains = len(e) * log_ratio(explained, float(e @ e))
+    def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
+        """One for each input."""
+        zones = () if residuals.stamps is None else self.zones
+        return listed(clock_shift(residuals, zones=zones, seed=seed))
 
-            def fit(variant: int) -> tuple[np.ndarray, np.ndarray]:
-                effect = tried.effect(variant)
-                also = beside.reshape(-1, Q.shape[1])[variant]
-                return effect - effect.mean(), effect + nuisance @ solved(R, q - also)
+    def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
+        """The input, and all inputs, read at other times from the instant on."""
+        channel, shift = str(evidence.where["channel"]), number_of(evidence, "shift")
+        times: tuple[float, ...] = (number_of(evidence, "time"),)
+        if "rule" in evidence.where:
+            times = seasons(record, str(evidence.where["rule"]), str(evidence.where["season"]))
+        together = model
+        prepared = model.check(record)[0]
+        for name in prepared.input_names[: prepared.n_inputs - model.direct]:
+            together = with_channel(together, ShiftedClock(name, shift, times))
+        alone = with_channel(model, ShiftedClock(channel, shift, times))
+        return [alone] if together == alone else [alone, together]
 
-            return gains, fit
+    def sentence(self, evidence: Evidence, model: Model) -> str:
+        """The shift and its instant as refits have them."""
+        found = set_last(model, ShiftedClock, "times")
+        last = found[-1]
+        if len(last.times) > 1:
+            return evidence.sentence
+        (at,), where = last.times, evidence.where
+        names = " and ".join(repr(c.channel) for c in found)
+        if "stamp" in where:
+            stamp = pd.Timestamp(str(where["stamp"])).tz_convert(str(where["zone"]))
+            stamp += pd.Timedelta(at - number_of(evidence, "time"), "s")
+            when = in_words(stamp)
+        else:
+            when = f"time {at:.5g}{unit_of(evidence)}"
+        return f"{off(names, last.shift, unit_of(evidence))} from {when}."
 
-        return score
+    def refine(self, model: Model, record: Record, times: int) -> Sequence[Model]:
+        """Other instants and shifts nearby, some samples away; what a rule says stays."""
+        found = set_last(model, ShiftedClock, "times")
+        last = found[-1]
+        if len(last.times) > 1:
+            return []
+        step, coarse = record.sampling_time, FARTHEST[times]
+        offsets = sorted({sign * k for k in coarse for sign in (-1, 0, 1)})
+        moved = {
+            (last.times[0] + i * step, last.shift + k * step) for i in offsets for k in range(-3, 4)
+        }
+        inside = [
+            (time, shift)
+            for time, shift in sorted(moved)
+            if record.time[0] < time < record.time[-1] and shift
+            if (time, shift) != (last.times[0], last.shift)
+        ]
+        return [changed(model, found, shift=shift, times=(time,)) for time, shift in inside]
 
-    return prepare
 
+def seasons(record: Record, zone: str, season: str) -> tuple[float, ...]:
+    """Times at which a zone's summers (or winters) begin and, in turn, end.
 
-def _refined(
-    r: Residuals,
-    whiten: Whitener,
-    nuisance: np.ndarray,
-    share: np.ndarray,
-    at: int,
-    shift: float,
-    edges: np.ndarray,
-) -> tuple[int, float, np.ndarray]:
-    """Instant and shift near those on the grids, alternately, and their effect (n,)."""
-    x = r.residual
-    there, Q, _ = projector(whiten, nuisance, ~np.isfinite(x))
-    e = whiten(x)[there]
-    e = e - Q @ (Q.T @ e)
-
-    def effect(at: int, shift: float) -> np.ndarray:
-        change = shifted(share, r.time, -shift) - share
-        return np.where(np.arange(len(x)) >= at, change, 0.0)
-
-    def left(at: int, shift: float) -> float:
-        w = whiten(effect(at, shift))[there]
-        w = w - Q @ (Q.T @ w)
-        return float(np.square(e - w).sum())
-
-    stride = int(np.diff(edges).max(initial=1))
-    for _ in range(2):
-        finer = np.linspace(shift / 1.5, shift * 1.5, 31)
-        shift = float(min([shift, *finer], key=lambda s: left(at, float(s))))
-        near = range(max(at - stride, 1), min(at + stride + 1, len(x) - 1))
-        at = min([at, *near], key=lambda k: left(k, shift))
-    return at, shift, effect(at, shift)
+    Over a record and a year before and after it. The first is a beginning.
+    """
+    assert record.start is not None
+    # Clocks change at full or half hours of UTC, whenever the record starts.
+    first = (record.start + pd.Timedelta(record.time[0] - 366 * DAY, "s")).tz_convert("UTC")
+    halves = pd.date_range(
+        first.floor("30min"), periods=48 * int(record.duration / DAY + 2 * 366), freq="30min"
+    )
+    saving = np.array([bool(stamp.dst()) for stamp in halves.tz_convert(zone).to_pydatetime()])
+    there = saving if season == "summers" else ~saving
+    changes = np.flatnonzero(np.diff(there.astype(int))) + 1
+    if len(changes) and not there[changes[0]]:
+        changes = changes[1:]
+    seconds = np.asarray((halves - record.start).total_seconds())
+    return tuple(float(seconds[k]) for k in changes)
