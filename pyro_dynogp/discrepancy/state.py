@@ -15,8 +15,8 @@ from pyro_dynogp.discrepancy.rounds import Looked, Rounds, Stopwatch, goes_with_
 from pyro_dynogp.discrepancy.search import Candidate, Found, candidates_of
 from pyro_dynogp.discrepancy.trials import without
 from pyro_dynogp.effects import ProcessNoise
+from pyro_dynogp.effects.base import OUTSIDE
 from pyro_dynogp.models.variants import Model, has_process_noise
-from pyro_dynogp.report.words import OUTSIDE
 from pyro_dynogp.statistics.evidence import Residuals
 
 if TYPE_CHECKING:

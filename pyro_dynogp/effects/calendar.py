@@ -13,11 +13,7 @@ from pyro_dynogp.data.channels.clock import DAY, DAYS_A_YEAR, turn_of_the_year
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.effects.base import Effect
 from pyro_dynogp.effects.clocks import ZONES, all_zones, in_zone, stamps_of
-from pyro_dynogp.models.variants import (
-    Model,
-    with_channel,
-    without_channel,
-)
+from pyro_dynogp.models.variants import Model, with_channel, without_channel
 from pyro_dynogp.statistics.bootstrap import columns_score, replicates, sieve, spanning
 from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
 from pyro_dynogp.statistics.shares_of_inputs import own
@@ -25,19 +21,13 @@ from pyro_dynogp.support.errors import invalid
 
 # Days that must be looked at before a contrast is tried: fewer do not repeat it.
 DAYS_FOR_HOURS, DAYS_FOR_WEEK, DAYS_FOR_YEAR = 3, 14, 548
-
 WEEKDAYS = ("Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun")
-
 TURN = ("20 Dec", "24 Dec", "28 Dec", "1 Jan", "5 Jan", "9 Jan", "13 Jan")
-
 SEASONS = ("Dec-Feb", "Mar-May", "Jun-Aug", "Sep-Nov")
-
 # Nats by which another clock than that of the stamps must be better to be named.
 OWN = 3.0
-
 # Contrasts of the year; the others are of the day and the week.
 YEARLY = ("season", "time of year", "turn of the year")
-
 # Parts of the calendar under the names of the channel that stands for them.
 CALENDAR_PARTS = {
     "hour of day by weekday/weekend": "hour of day by weekend",

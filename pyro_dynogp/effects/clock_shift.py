@@ -11,25 +11,11 @@ from pyro_dynogp.data.channels import ShiftedClock
 from pyro_dynogp.data.channels.clock import DAY
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.signals import shifted
-from pyro_dynogp.effects.base import (
-    Effect,
-    changed,
-    listed,
-    number_of,
-    set_last,
-    unit_of,
-)
+from pyro_dynogp.effects.base import Effect, changed, listed, number_of, set_last, unit_of
 from pyro_dynogp.effects.clock_shift_score import refined_shift, score_of_shifts, shifts_of
 from pyro_dynogp.effects.clocks import ZONES, all_zones, clock_shares, in_zone
-from pyro_dynogp.models.variants import (
-    Model,
-    with_channel,
-)
-from pyro_dynogp.statistics.bootstrap import (
-    replicates,
-    sieve,
-    spanning,
-)
+from pyro_dynogp.models.variants import Model, with_channel
+from pyro_dynogp.statistics.bootstrap import replicates, sieve, spanning
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
 from pyro_dynogp.statistics.shares_of_inputs import check_inputs
 from pyro_dynogp.statistics.time_pictures import in_words, instant, over_time
@@ -37,14 +23,11 @@ from pyro_dynogp.support.errors import invalid
 
 # Shifts of the whole record, which are none of the clock's, together with their sums [steps].
 WHOLE = (-4, -2, -1, 0, 1, 2, 4)
-
 # Channels of the largest share that are tried.
 CHANNELS = 6
-
 # A rule has no instant to choose: it wins unless another instant is this much better [nats]; so
 # do summers beside winters.
 PREFERENCE = 3.0
-
 # Samples by which the instant of a shifted clock is moved to refine it, first and then.
 FARTHEST = ((7, 14, 21, 28, 35), (1, 2, 3))
 

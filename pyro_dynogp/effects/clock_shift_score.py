@@ -7,19 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from pyro_dynogp.data.signals import shifted
-from pyro_dynogp.statistics.bootstrap import (
-    Prepare,
-    Score,
-    log_ratio,
-    projector,
-    solved,
-)
+from pyro_dynogp.statistics.bootstrap import Prepare, Score, log_ratio, projector, solved
 from pyro_dynogp.statistics.evidence import Residuals
 from pyro_dynogp.statistics.whitening import Whitener
 
 # Shifts that are tried [steps], both ways; and one hour where there are stamps.
 SHIFTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
-
 # Instants of change on the first pass, and the share of the record kept on either side.
 INSTANTS, END = 60, 0.05
 

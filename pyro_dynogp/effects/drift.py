@@ -9,29 +9,15 @@ import numpy as np
 
 from pyro_dynogp.data.channels import Trend, TrendOfGain
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.effects.base import (
-    Effect,
-    centre_of,
-)
-from pyro_dynogp.models.variants import (
-    Model,
-    with_channel,
-    with_pairs,
-    with_process_noise,
-)
-from pyro_dynogp.statistics.bootstrap import (
-    columns_score,
-    replicates,
-    sieve,
-    spanning,
-)
+from pyro_dynogp.effects.base import Effect, centre_of
+from pyro_dynogp.models.variants import Model, with_channel, with_pairs, with_process_noise
+from pyro_dynogp.statistics.bootstrap import columns_score, replicates, sieve, spanning
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
 from pyro_dynogp.statistics.shares_of_inputs import paths
 from pyro_dynogp.statistics.time_pictures import over_time, size_in_words
 
 # Cosines of a drift: the slowest runs once from one end to the other, the fastest four times.
 SLOW = ((1,), (1, 2), (1, 2, 3, 4))
-
 # Inputs beyond which a drift of gain is looked for in the mean as a whole only.
 INPUTS = 4
 

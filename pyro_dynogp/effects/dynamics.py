@@ -9,9 +9,7 @@ from scipy import signal as signals
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.signals import held
-from pyro_dynogp.effects.base import (
-    Effect,
-)
+from pyro_dynogp.effects.base import Effect
 from pyro_dynogp.models.variants import Model, with_pairs
 from pyro_dynogp.statistics.detecting import (
     NOTICED,
@@ -28,7 +26,6 @@ from pyro_dynogp.statistics.shares_of_inputs import check_inputs, looked_at
 
 # Damping ratio of the resonances that are tried: broad enough for a grid of twelve frequencies.
 DAMPING, FREQUENCIES = 0.15, 12
-
 # Damping ratios of which the best is named.
 DAMPINGS = (0.02, 0.05, 0.1, 0.2, 0.4, 0.7)
 

@@ -10,11 +10,7 @@ import numpy as np
 from pyro_dynogp.data.channels import Channel, Delayed, Product, Recorded, Transformed
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.signals import delayed, held
-from pyro_dynogp.effects.base import (
-    Effect,
-    centre_of,
-    number_of,
-)
+from pyro_dynogp.effects.base import Effect, centre_of, number_of
 from pyro_dynogp.effects.delay_regression import resolved
 from pyro_dynogp.models.variants import Model, with_channel
 from pyro_dynogp.statistics.detecting import (

@@ -8,12 +8,8 @@ import numpy as np
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.signals import held
-from pyro_dynogp.effects.base import (
-    Effect,
-)
-from pyro_dynogp.models.variants import (
-    Model,
-)
+from pyro_dynogp.effects.base import Effect
+from pyro_dynogp.models.variants import Model
 from pyro_dynogp.statistics.autoregression import fitted_filter
 from pyro_dynogp.statistics.bootstrap import projector, spanning
 from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals

@@ -9,23 +9,13 @@ from scipy import stats
 from scipy.optimize import minimize_scalar
 
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.effects.base import (
-    Effect,
-    number_of,
-)
+from pyro_dynogp.effects.base import Effect, number_of
 from pyro_dynogp.layers.noise import StudentT
-from pyro_dynogp.models.variants import (
-    Model,
-    with_likelihood,
-)
+from pyro_dynogp.models.variants import Model, with_likelihood
 from pyro_dynogp.statistics.autoregression import fitted_filter
 from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
 from pyro_dynogp.statistics.scan import tail_probability
-from pyro_dynogp.statistics.serial import (
-    REPLICATES,
-    held_out_innovations,
-    one_step_sd,
-)
+from pyro_dynogp.statistics.serial import REPLICATES, held_out_innovations, one_step_sd
 from pyro_dynogp.support.errors import invalid
 
 # Degrees of freedom that are looked through; beyond the last a Student-t is normal.

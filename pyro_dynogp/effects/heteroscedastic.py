@@ -8,21 +8,13 @@ import numpy as np
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.signals import held
-from pyro_dynogp.effects.base import (
-    Effect,
-)
+from pyro_dynogp.effects.base import Effect
 from pyro_dynogp.layers.noise import Driver, Heteroscedastic
-from pyro_dynogp.models.variants import (
-    Model,
-    with_likelihood,
-)
+from pyro_dynogp.models.variants import Model, with_likelihood
 from pyro_dynogp.statistics.bootstrap import columns_score, replicates, sieve, spanning
 from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
 from pyro_dynogp.statistics.responses import filtered
-from pyro_dynogp.statistics.serial import (
-    held_out_innovations,
-    one_step_sd,
-)
+from pyro_dynogp.statistics.serial import held_out_innovations, one_step_sd
 
 # Slow responses that may drive the size of the noise [steps].
 MEMORY = (4.0, 16.0)

@@ -9,17 +9,9 @@ import numpy as np
 from pyro_dynogp.data.channels import Play
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.signals import play
-from pyro_dynogp.effects.base import (
-    AROUND,
-    Effect,
-    finer,
-    number_of,
-)
+from pyro_dynogp.effects.base import AROUND, Effect, finer, number_of
 from pyro_dynogp.effects.linear_responses import linear_responses
-from pyro_dynogp.models.variants import (
-    Model,
-    with_channel,
-)
+from pyro_dynogp.models.variants import Model, with_channel
 from pyro_dynogp.statistics.detecting import (
     NOTICED,
     about,

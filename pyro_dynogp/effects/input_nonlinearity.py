@@ -8,22 +8,10 @@ import numpy as np
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.signals import hermite, hinges
-from pyro_dynogp.effects.base import (
-    Effect,
-)
+from pyro_dynogp.effects.base import Effect
 from pyro_dynogp.effects.linear_responses import linear_responses
-from pyro_dynogp.models.variants import (
-    Model,
-    with_input_function,
-)
-from pyro_dynogp.statistics.detecting import (
-    about,
-    binned,
-    evidence,
-    labelled,
-    lasting,
-    unexplained,
-)
+from pyro_dynogp.models.variants import Model, with_input_function
+from pyro_dynogp.statistics.detecting import about, binned, evidence, labelled, lasting, unexplained
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
 from pyro_dynogp.statistics.regression import with_past
 from pyro_dynogp.statistics.responses import responses

@@ -8,14 +8,8 @@ import numpy as np
 
 from pyro_dynogp.data.channels import Step
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.effects.base import (
-    Effect,
-    number_of,
-)
-from pyro_dynogp.models.variants import (
-    Model,
-    with_channel,
-)
+from pyro_dynogp.effects.base import Effect, number_of
+from pyro_dynogp.models.variants import Model, with_channel
 from pyro_dynogp.statistics.bootstrap import (
     Prepare,
     Score,
@@ -32,7 +26,6 @@ from pyro_dynogp.statistics.whitening import Whitener
 
 # Share of the record at each end where no level shift is looked for: too short to tell a level.
 END = 0.03
-
 # Levels of a staircase that stands for any step while the first filter is fitted.
 LEVELS = 8
 

@@ -7,21 +7,9 @@ from typing import ClassVar
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.signals import hermite, hinges
-from pyro_dynogp.effects.base import (
-    Effect,
-)
-from pyro_dynogp.models.variants import (
-    Model,
-    with_output_function,
-)
-from pyro_dynogp.statistics.detecting import (
-    about,
-    binned,
-    evidence,
-    labelled,
-    lasting,
-    unexplained,
-)
+from pyro_dynogp.effects.base import Effect
+from pyro_dynogp.models.variants import Model, with_output_function
+from pyro_dynogp.statistics.detecting import about, binned, evidence, labelled, lasting, unexplained
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
 from pyro_dynogp.statistics.regression import with_past
 

@@ -11,15 +11,8 @@ from pyro_dynogp.data.channels import Sinusoid
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.effects.base import Effect, changed, number_of, unit_of
 from pyro_dynogp.effects.periodic_lines import harmonics, lines, refined, slots
-from pyro_dynogp.models.variants import (
-    Model,
-    with_channel,
-)
-from pyro_dynogp.statistics.bootstrap import (
-    replicates,
-    sieve,
-    spanning,
-)
+from pyro_dynogp.models.variants import Model, with_channel
+from pyro_dynogp.statistics.bootstrap import replicates, sieve, spanning
 from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
 from pyro_dynogp.statistics.shares_of_inputs import own
 from pyro_dynogp.statistics.time_pictures import size_in_words
@@ -28,7 +21,6 @@ from pyro_dynogp.support.errors import invalid
 # A period is at least this often in what is looked at; slower is drift. Grid of frequencies: so
 # many for each 1 / duration.
 CYCLES, OVERSAMPLING = 3.0, 4
-
 # Shares of its resolution by which a period is moved to refine it, first and then.
 NEARER = ((-0.1, -0.05, 0.05, 0.1), (-0.03, 0.03))
 

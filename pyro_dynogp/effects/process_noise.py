@@ -7,15 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.effects.base import (
-    Effect,
-)
-from pyro_dynogp.models.variants import (
-    Model,
-    has_process_noise,
-    with_pairs,
-    with_process_noise,
-)
+from pyro_dynogp.effects.base import Effect
+from pyro_dynogp.models.variants import Model, has_process_noise, with_pairs, with_process_noise
 from pyro_dynogp.statistics.autoregression import fitted_filter
 from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
 from pyro_dynogp.statistics.serial import held_out_innovations, one_step_sd, portmanteau

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from scipy import stats
 from scipy.signal import lfilter
 
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.effects.base import (
-    Effect,
-    number_of,
-)
-from pyro_dynogp.models.variants import (
-    Model,
-    with_output_function,
-)
+from pyro_dynogp.effects.base import Effect, Parameters, number_of
+from pyro_dynogp.models.variants import Model, with_output_function
+from pyro_dynogp.models.wiring import Static
 from pyro_dynogp.statistics.autoregression import fitted_filter
 from pyro_dynogp.statistics.detecting import (
     NOTICED,
@@ -36,15 +30,15 @@ from pyro_dynogp.statistics.evidence import Evidence, Residuals
 from pyro_dynogp.statistics.regression import with_past
 from pyro_dynogp.statistics.scan import tail_probability
 
+if TYPE_CHECKING:
+    from pyro_dynogp.inference.fitted import Fit
+
 # Exact ties as improbable as this are a limit, and name it.
 TIED = 0.01
-
 # Largest slope beyond a limit, as a share of that before it: what goes on rising is no limit.
 FLAT = 0.3
-
 # Quantiles of the mean above which it may flatten; below, their complements.
 UPPER = np.array([0.5, 0.6, 0.7, 0.8, 0.9, 0.95])
-
 # Values as near as this to each other, against the range, are the same number.
 SAME = 1e-9
 
@@ -62,7 +56,7 @@ def saturation(residuals: Residuals, *, seed: int = 0) -> Evidence:
     r = residuals
     top = ties_at_the_top(r.output, r.mean, seed=seed)
     bottom = ties_at_the_top(-r.output, -r.mean, seed=seed)
-    bottom = dataclasses.replace(bottom, limit=-bottom.limit)
+    bottom = replace(bottom, limit=-bottom.limit)
     tied = min(1.0, 2.0 * min(top.p_value, bottom.p_value))
     knots = _knots(r.mean)
     found = of_positive_weight(
@@ -74,7 +68,7 @@ def saturation(residuals: Residuals, *, seed: int = 0) -> Evidence:
         low = bottom.limit if bottom.p_value < TIED or bottom.p_value < top.p_value else -np.inf
         high = top.limit if top.p_value < TIED or top.p_value <= bottom.p_value else np.inf
         gain = -float(np.log(max(tied, 1e-300)))
-        found = dataclasses.replace(
+        found = replace(
             found,
             statistic=(2.0 * gain - 1.0) / np.sqrt(2.0),
             gain=gain,
@@ -90,7 +84,7 @@ def saturation(residuals: Residuals, *, seed: int = 0) -> Evidence:
     flattened = np.clip(r.mean, low, high)
     return evidence(
         "saturation",
-        dataclasses.replace(found, p_value=p),
+        replace(found, p_value=p),
         {"low": low, "high": high},
         f"'{r.output_name}' stops at {' and '.join(limits)}{how}{about(r, found)}.",
         binned(
@@ -240,3 +234,25 @@ class Saturation(Effect):
         limits = None if low is None and high is None else (low, high)
         extended = with_output_function(model, limits)
         return [] if extended is None else [extended]
+
+    def parameters(self, fit: Fit, evidence: Evidence, record: Record) -> Parameters:
+        """Limits of the sensor: its function where that is highest, or lowest.
+
+        Posterior mean and standard deviation of the function [output] where it is best known of
+        where it is at its limit to within a standard deviation; of the limits in the evidence.
+        """
+        if not isinstance(fit.model.layers[-1], Static):
+            return {}
+        band = fit.static_function(fit.model.wires[-1].name, record)
+        seen = (band.x >= band.inputs.min()) & (band.x <= band.inputs.max())
+        mean, sd = band.mean[seen, 0], band.sd[seen, 0]
+        scale, offset = fit.scaling.output_scale[0], fit.scaling.output_offset[0]
+        limits: Parameters = {}
+        for end, name, sign in (("low", "lower limit", -1.0), ("high", "upper limit", 1.0)):
+            if np.isfinite(number_of(evidence, end)):
+                top = int((sign * mean).argmax())
+                flat = sign * mean >= sign * mean[top] - sd[top]
+                at = int(np.where(flat, sd, np.inf).argmin())
+                label = labelled(name, fit.scaling.output_units[0])
+                limits[label] = float(offset + scale * mean[at]), float(scale * sd[at])
+        return limits
