@@ -168,7 +168,14 @@ def _in_zone(local: pd.DatetimeIndex, zone: str, days: int) -> tuple[list[Contra
     K = max(len(np.unique(hour)) - 1, 1)
     contrasts, blocks = list[Contrast](), list[np.ndarray]()
 
-    def add(what: str, degrees: int, new: np.ndarray, groups, labels, also=()) -> None:
+    def add(
+        what: str,
+        degrees: int,
+        new: np.ndarray,
+        groups: np.ndarray,
+        labels: Sequence[str],
+        also: Sequence[int] = (),
+    ) -> None:
         first = sum(b.shape[1] for b in blocks)
         blocks.append(new)
         columns = (*also, *range(first, first + new.shape[1]))

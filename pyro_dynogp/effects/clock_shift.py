@@ -80,12 +80,8 @@ def clock_shift(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 
         replicates=replicates(len(r), 2 * nuisance.shape[1] + tried.changes.shape[1]),
         seed=seed,
     )
-    J, ruled = tried.changes.shape[1], len(parts) * tried.changes.shape[1]
-    best = found.best
-    if ruled and found.gains[:ruled].max() > found.gain - PREFERENCE:
-        # Daylight saving is an hour of summers, unless winters are that much better.
-        worse = PREFERENCE * np.array([season == "winters" for season, _ in rules])
-        best = int(np.argmax(found.gains[:ruled] - np.repeat(worse, J)))
+    J = tried.changes.shape[1]
+    best = _preferred(found.gains, found.best, rules, J)
     place, j = divmod(best, J)
     name, shift = names[tried.channels[j]], float(tried.shifts[j])
     share = shares[:, tried.channels[j]]
@@ -117,6 +113,21 @@ def clock_shift(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 
         f"about {size:.2g} {r.output_unit} (rms) of {r.output_name!r}.",
         curve=over_time(r, effect - effect.mean()),
     )
+
+
+def _preferred(gains: np.ndarray, best: int, rules: Sequence[tuple[str, str]], count: int) -> int:
+    """The best variant, or that of a rule where it is about as good.
+
+    Args:
+        gains: of all variants, those of rules first [nats]. best: place of the largest.
+        rules: season and zone of each. count: variants of each.
+    """
+    ruled = len(rules) * count
+    if not ruled or gains[:ruled].max() <= gains[best] - PREFERENCE:
+        return best
+    # Daylight saving is an hour of summers, unless winters are that much better.
+    worse = PREFERENCE * np.array([season == "winters" for season, _ in rules])
+    return int(np.argmax(gains[:ruled] - np.repeat(worse, count)))
 
 
 def off(names: str, shift: float, unit: str) -> str:

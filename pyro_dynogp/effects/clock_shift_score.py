@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pyro_dynogp.data.signals import shifted
-from pyro_dynogp.statistics.bootstrap import Prepare, Score, log_ratio, projector, solved
+from pyro_dynogp.statistics.bootstrap import Prepare, Score, Scored, log_ratio, projector, solved
 from pyro_dynogp.statistics.evidence import Residuals
 from pyro_dynogp.statistics.whitening import Whitener
 
@@ -99,7 +99,7 @@ def score_of_shifts(tried: Shifts, nuisance: np.ndarray, missing: np.ndarray) ->
         beside = against(Q)
         norm = np.concatenate([masks @ squares, later]) - np.square(beside).sum(2)
 
-        def score(x: np.ndarray):
+        def score(x: np.ndarray) -> Scored:
             e0 = whiten(x)[there]
             q = Q.T @ e0
             e = e0 - Q @ q

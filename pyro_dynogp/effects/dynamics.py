@@ -13,6 +13,7 @@ from pyro_dynogp.effects.base import Effect
 from pyro_dynogp.models.variants import Model, with_pairs
 from pyro_dynogp.statistics.detecting import (
     NOTICED,
+    evidence,
     labelled,
     lasting,
     located,
@@ -76,18 +77,15 @@ def unmodelled_dynamics(residuals: Residuals, *, seed: int = 0) -> Evidence:
         constant = float(constants[np.argmax(gains)])
     blank = np.full(len(frequencies), np.nan)
     label = labelled("frequency", f"rad/{r.time_unit}" if r.time_unit else "")
-    return Evidence(
-        effect="unmodelled dynamics",
-        statistic=found.statistic,
-        p_value=found.p_value,
-        gain=found.gain,
-        size=found.size,
-        where={"frequency": peak, "time_constant": constant},
-        sentence=f"'{r.output_name}' responds to channel '{r.input_names[j]}' by dynamics that the "
+    return evidence(
+        "unmodelled dynamics",
+        found,
+        {"frequency": peak, "time_constant": constant},
+        f"'{r.output_name}' responds to channel '{r.input_names[j]}' by dynamics that the "
         f"model lacks (time constant about {constant:.2g}{unit(r.time_unit)}, frequency "
         f"{peak:.2g} rad{'/' + r.time_unit if r.time_unit else ''}), "
         f"about {found.size:.2g}{unit(r.output_unit)} (rms).",
-        curve=Curve(frequencies, coherence, blank, label, f"coherence with {r.input_names[j]}"),
+        Curve(frequencies, coherence, blank, label, f"coherence with {r.input_names[j]}"),
     )
 
 

@@ -16,6 +16,7 @@ from pyro_dynogp.models.variants import Model, with_channel
 from pyro_dynogp.statistics.detecting import (
     NOTICED,
     binned,
+    evidence,
     labelled,
     lasting,
     located,
@@ -84,16 +85,13 @@ def _extra(residuals: Residuals, name: str, nuisance: np.ndarray, seed: int) -> 
         delay = delay if alone[1] - alone[0] > DELAY_GAIN and delay >= r.step else 0.0
     late = f", {delay:.3g}{unit(r.time_unit)} later" if delay else ""
     how = {"linear": "", "square": " by its square", "absolute": " by its absolute value"}
-    return Evidence(
-        effect="extra input",
-        statistic=found.statistic,
-        p_value=found.p_value,
-        gain=found.gain,
-        size=found.size,
-        where={"channel": name, "form": form, "delay": delay},
-        sentence=f"Channel '{name}' acts on '{r.output_name}'{how.get(form, f' as {form}')}{late}, "
+    return evidence(
+        "extra input",
+        found,
+        {"channel": name, "form": form, "delay": delay},
+        f"Channel '{name}' acts on '{r.output_name}'{how.get(form, f' as {form}')}{late}, "
         f"about {found.size:.2g}{unit(r.output_unit)} (rms).",
-        curve=binned(
+        binned(
             r,
             delayed(held(r.candidates[name]), r.time, delay),
             unexplained(r, nuisance, fitted),

@@ -16,6 +16,7 @@ from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
 from pyro_dynogp.statistics.scan import tail_probability
 from pyro_dynogp.statistics.serial import REPLICATES
 from pyro_dynogp.statistics.shares_of_inputs import own
+from pyro_dynogp.statistics.whitening import Whitener
 
 # Of future inputs: a controller answers within as many samples.
 AHEAD = (1, 2, 4, 8, 16)
@@ -52,7 +53,10 @@ def feedback(residuals: Residuals, *, seed: int = 0) -> list[Evidence]:
     return found
 
 
-def _followed(r, x, whiten, name: str, u: np.ndarray, seed: int) -> Evidence:
+def _followed(
+    r: Residuals, x: np.ndarray, whiten: Whitener, name: str, u: np.ndarray, seed: int
+) -> Evidence:
+    """Evidence for one input u (n,); x (n,): the residual where held out, whitened by `whiten`."""
     foretell = fitted_filter(u)
     n, K = len(u), AHEAD[-1]
     surprise = np.full(n, np.nan)

@@ -13,6 +13,7 @@ from pyro_dynogp.models.variants import Model, with_channel
 from pyro_dynogp.statistics.bootstrap import (
     Prepare,
     Score,
+    Scored,
     explained_by,
     log_ratio,
     projector,
@@ -106,7 +107,7 @@ def _steps(places: np.ndarray, nuisance: np.ndarray, missing: np.ndarray) -> Pre
         left = norm - np.square(beside).sum(1)
         usable = left > 1e-6 * norm
 
-        def score(x: np.ndarray):
+        def score(x: np.ndarray) -> Scored:
             e0 = whiten(x)[there]
             q = Q.T @ e0
             e = e0 - Q @ q

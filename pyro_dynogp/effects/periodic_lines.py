@@ -10,6 +10,7 @@ from scipy.stats import chi2
 from pyro_dynogp.statistics.bootstrap import (
     Prepare,
     Score,
+    Scored,
     explained_by,
     log_ratio,
     projector,
@@ -60,7 +61,7 @@ def lines(bins: np.ndarray, length: int, nuisance: np.ndarray, missing: np.ndarr
             F = rfft(full, length, axis=1)[:, bins]
             return F.real, -F.imag
 
-        def score(x: np.ndarray):
+        def score(x: np.ndarray) -> Scored:
             past = [x[rows - k] for k in range(1, p + 1)]
             Q = np.linalg.qr(np.column_stack([beside, *past]))[0]
             e = x[rows] - Q @ (Q.T @ x[rows])
