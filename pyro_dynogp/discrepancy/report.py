@@ -15,8 +15,8 @@ from pyro_dynogp.statistics.evidence import Curve, Evidence
 if TYPE_CHECKING:
     from pyro_dynogp.data.record import Record
     from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.models.description import Part
     from pyro_dynogp.prediction.prediction import Prediction
-    from pyro_dynogp.report.words import Part
 
 Decision = Literal["accepted", "tie", "rejected", "not tried", "reported"]
 

@@ -17,9 +17,9 @@ from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.discrepancy.state import Course
 from pyro_dynogp.discrepancy.trials import one_step_density
 from pyro_dynogp.effects.base import Effect, experiment
+from pyro_dynogp.models.description import describe, in_words
 from pyro_dynogp.prediction.records import joined
 from pyro_dynogp.prediction.scores import scores
-from pyro_dynogp.report import words
 from pyro_dynogp.statistics.evidence import Residuals
 from pyro_dynogp.support.parallel import parallel_map
 
@@ -77,8 +77,8 @@ def report_of(base: Fit, extended: Fit, course: Course, warnings: Sequence[str])
         known=data.known,
         forecast_before=forecasts[0],
         forecast_after=forecasts[1],
-        model_before=words.describe(base.model),
-        model_after=words.describe(extended.model),
+        model_before=describe(base.model),
+        model_after=describe(extended.model),
         seconds=dict(watch.seconds),
     )
 
@@ -143,7 +143,7 @@ def _effect(
     assert attempt is not None
     assert confirmed.model is not None
     own = [one for one in confirmed.model.channels if one not in confirmed.before.channels]
-    parts = [words.in_words(one) for one in own] or words.describe(confirmed.model)
+    parts = [in_words(one) for one in own] or describe(confirmed.model)
     parameters = parameters_of(extended, own, record)
     parameters |= found.effect.parameters(extended, found.evidence, record)
     return FoundEffect(

@@ -6,8 +6,8 @@ import numpy as np
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.report import Attempt, FoundEffect, Report
+from pyro_dynogp.models.description import Part
 from pyro_dynogp.prediction.prediction import Prediction
-from pyro_dynogp.report.words import Part
 from pyro_dynogp.statistics.evidence import Curve, Evidence
 
 GIVEN = (

@@ -11,12 +11,12 @@ import pytest
 
 import pyro_dynogp as dgp
 from pyro_dynogp.data.channels import Delayed, Recorded, Step, Trend
+from pyro_dynogp.models.description import Part, describe
 from pyro_dynogp.models.variants import with_channel, with_likelihood, with_output_function
 from pyro_dynogp.report.html.diagram import diagram, marks
 from pyro_dynogp.report.html.html import number, plus_minus, probability
 from pyro_dynogp.report.html.page import _headline, page
 from pyro_dynogp.report.html.scores import change_of_elpd, change_of_error, change_of_share
-from pyro_dynogp.report.words import Part, describe
 from tests.discrepancy import reports
 
 VOID = {"img", "meta", "br"}

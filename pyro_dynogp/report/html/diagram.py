@@ -5,8 +5,8 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Sequence
 
+from pyro_dynogp.models.description import Part
 from pyro_dynogp.report.html.html import text
-from pyro_dynogp.report.words import Part
 
 # Sizes in units of the drawing; a row holds as many boxes as fit into its width.
 WIDTH, BOX, GAP, LINE, EDGE = 920, 158, 30, 16, 13
