@@ -18,9 +18,6 @@ PACKAGE = "pyro_dynogp"
 # Arrows that run upwards today, each with its reason. An arrow that is gone has to leave the list.
 UPWARD = {
     ("discrepancy.report", "report.html.page"): "Report.to_html writes its page",
-    ("discrepancy.reporting", "report.words"): "until an effect has its own words",
-    ("discrepancy.state", "report.words"): "until an effect has its own words",
-    ("effects.base", "discrepancy.trials"): "two type aliases, until they are in effects.base",
     ("inference.fitted", "criticism.inference_data"): "until Fit stands above criticism",
     ("inference.fitted", "prediction.first_state"): "until Fit stands above prediction",
     ("inference.fitted", "prediction.layers"): "until Fit stands above prediction",

@@ -18,7 +18,7 @@ from pyro_dynogp.discrepancy.residuals import residuals_of
 from pyro_dynogp.discrepancy.search import Found, look, rated
 from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
 from pyro_dynogp.discrepancy.trials import forecast_density, forecast_errors, without
-from pyro_dynogp.effects import ClockShift, Effect
+from pyro_dynogp.effects import Effect
 from pyro_dynogp.models.variants import (
     used_channels,
     with_process_noise,
@@ -29,15 +29,6 @@ from pyro_dynogp.statistics.omnibus import Beyond, beyond_catalogue, structure_l
 
 if TYPE_CHECKING:
     from pyro_dynogp.inference.fitted import Fit
-
-# Families of effects that go with inputs.
-OF_INPUTS = ("paths", "shapes")
-
-
-def goes_with_inputs(effect: Effect) -> bool:
-    """Whether an effect is one between inputs and output."""
-    of_inputs = effect.family in OF_INPUTS and effect.score == "forecast"
-    return of_inputs or isinstance(effect, ClockShift)
 
 
 class Stopwatch:
@@ -136,7 +127,7 @@ class SearchContext:
         everywhere = np.ones(len(self.data.known), dtype=bool)
         whole = [replace(one, held_out=everywhere) for one in left]
         effects = [e for e in self.effects if not (e.once and e.name in known)]
-        of_inputs = [e for e in effects if e.family in OF_INPUTS and e.score == "forecast"]
+        of_inputs = [e for e in effects if e.acts_on == "inputs"]
         others = [e for e in effects if e not in of_inputs]
         found, notes = [], []
         for where, some in ((whole, of_inputs), (residuals, others)):

@@ -13,18 +13,16 @@ from pyro_dynogp.criticism.posterior_draws import draws_of
 from pyro_dynogp.data.channels import Channel, Delayed, Quantity, count_direct, prepared
 from pyro_dynogp.data.channels.base import unit_of
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.effects.base import Parameters
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.methods.numbers import Number, number_posterior
 from pyro_dynogp.lti.views import steady_state_gain
 from pyro_dynogp.models.delays import where_inputs_are_known
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.wiring import Static
 
 if TYPE_CHECKING:
     from pyro_dynogp.inference.fitted import Fit
-    from pyro_dynogp.statistics.evidence import Evidence
 
-Parameters = dict[str, tuple[float, float]]
 DRAWS = 200
 # Beyond how many times a delay, and how many steps more, others are not expected; and the share of
 # a record that may be lost to comparing them.
@@ -50,32 +48,6 @@ def parameters_of(fit: Fit, channels: Sequence[Channel], record: Record) -> Para
         out |= _weights(fit, acting, drawn) | _gains(fit, acting, drawn)
     for group in _together(present):
         out |= _numbers(fit, group, record)
-    return out
-
-
-def limits_of(fit: Fit, evidence: Evidence, record: Record) -> Parameters:
-    """Limits of a sensor that stops: its function where that is highest, or lowest.
-
-    Posterior mean and standard deviation of the function [output] where it is best known of where
-    it is at its limit to within a standard deviation; of the limits that the evidence has.
-    """
-    if evidence.effect != "saturation":
-        return {}
-    if not isinstance(fit.model.layers[-1], Static):
-        return {}
-    band = fit.static_function(fit.model.wires[-1].name, record)
-    seen = (band.x >= band.inputs.min()) & (band.x <= band.inputs.max())
-    mean, sd = band.mean[seen, 0], band.sd[seen, 0]
-    scale, offset = fit.scaling.output_scale[0], fit.scaling.output_offset[0]
-    out: Parameters = {}
-    for end, sign in (("low", -1.0), ("high", 1.0)):
-        if np.isfinite(float(evidence.where[end])):
-            name = "lower limit" if end == "low" else "upper limit"
-            top = int((sign * mean).argmax())
-            flat = sign * mean >= sign * mean[top] - sd[top]
-            at = int(np.where(flat, sd, np.inf).argmin())
-            pair = float(offset + scale * mean[at]), float(scale * sd[at])
-            out[_label(name, fit.scaling.output_units[0])] = pair
     return out
 
 

@@ -15,6 +15,7 @@ from pyro_dynogp.statistics.evidence import Curve, Evidence
 if TYPE_CHECKING:
     from pyro_dynogp.data.record import Record
     from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.models.description import Part
     from pyro_dynogp.prediction.prediction import Prediction
 
 Decision = Literal["accepted", "tie", "rejected", "not tried", "reported"]
@@ -95,7 +96,7 @@ class Report:
         data: which part was for what. tests: p-value of each test on C before and after, by effect.
         sealed: block C. known: blocks A and B.
         forecast_before, forecast_after: of C.
-        model_before, model_after: the models in words, a line for each part.
+        model_before, model_after: the models in words, part by part.
         seconds: by stage.
     """
 
@@ -116,8 +117,8 @@ class Report:
     known: Record
     forecast_before: Prediction
     forecast_after: Prediction
-    model_before: tuple[str, ...]
-    model_after: tuple[str, ...]
+    model_before: tuple[Part, ...]
+    model_after: tuple[Part, ...]
     seconds: Mapping[str, float] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
@@ -134,8 +135,8 @@ class Report:
             "left": list(self.left),
             "warnings": list(self.warnings),
             "data": self.data,
-            "model_before": list(self.model_before),
-            "model_after": list(self.model_after),
+            "model_before": [str(part) for part in self.model_before],
+            "model_after": [str(part) for part in self.model_after],
             "seconds": dict(self.seconds),
         }
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,16 +11,16 @@ from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.context import SearchContext
 from pyro_dynogp.discrepancy.decision import Confirmed
-from pyro_dynogp.discrepancy.parameters import limits_of, parameters_of
+from pyro_dynogp.discrepancy.parameters import parameters_of
 from pyro_dynogp.discrepancy.report import FoundEffect, Report
 from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
 from pyro_dynogp.discrepancy.state import SearchState
 from pyro_dynogp.discrepancy.trials import one_step_density
-from pyro_dynogp.effects import Effect
+from pyro_dynogp.effects.base import Effect, experiment
+from pyro_dynogp.models.description import describe, in_words
 from pyro_dynogp.prediction.records import joined
 from pyro_dynogp.prediction.scores import scores
-from pyro_dynogp.report import words
 from pyro_dynogp.statistics.evidence import Residuals
 from pyro_dynogp.support.parallel import parallel_map
 
@@ -57,7 +57,7 @@ def report_of(base: Fit, extended: Fit, course: SearchState, warnings: Sequence[
     watch.stop("scores of the last block")
     tests = _tested([f for f, _ in accepted], (base, extended), whole, sealed, rounds)
     watch.stop("residual tests of the last block")
-    effects = [_effect(f, c, extended, data.known) for f, c in accepted]
+    effects = [_effect(f, c, extended, data.known, rounds.effects) for f, c in accepted]
     watch.stop("numbers of the effects")
     return Report(
         effects=(*effects, *(_only_reported(f) for f in course.reported)),
@@ -77,8 +77,8 @@ def report_of(base: Fit, extended: Fit, course: SearchState, warnings: Sequence[
         known=data.known,
         forecast_before=forecasts[0],
         forecast_after=forecasts[1],
-        model_before=words.describe(base.model),
-        model_after=words.describe(extended.model),
+        model_before=describe(base.model),
+        model_after=describe(extended.model),
         seconds=dict(watch.seconds),
     )
 
@@ -140,14 +140,20 @@ def _tested(
     return {effect.name: (p[2 * k], p[2 * k + 1]) for k, effect in enumerate(effects)}
 
 
-def _effect(found: Found, confirmed: Confirmed, extended: Fit, record: Record) -> FoundEffect:
+def _effect(
+    found: Found,
+    confirmed: Confirmed,
+    extended: Fit,
+    record: Record,
+    effects: Collection[Effect],
+) -> FoundEffect:
     attempt = confirmed.attempt
     assert attempt is not None
     assert confirmed.model is not None
     own = [one for one in confirmed.model.channels if one not in confirmed.before.channels]
-    lines = [words.in_words(one) for one in own] or words.describe(confirmed.model)
+    parts = [in_words(one) for one in own] or describe(confirmed.model)
     parameters = parameters_of(extended, own, record)
-    parameters |= limits_of(extended, found.evidence, record)
+    parameters |= found.effect.parameters(extended, found.evidence, record)
     return FoundEffect(
         name=found.effect.name,
         sentence=found.effect.sentence(found.evidence, confirmed.model),
@@ -157,10 +163,10 @@ def _effect(found: Found, confirmed: Confirmed, extended: Fit, record: Record) -
         gain_error=attempt.gain_error,
         size=found.evidence.size,
         parameters=parameters,
-        block="; ".join(lines),
+        block="; ".join(map(str, parts)),
         curve=found.evidence.curve,
         ties=confirmed.ties,
-        experiment=words.experiment(found.effect.name, confirmed.ties),
+        experiment=experiment(found.effect.name, confirmed.ties, effects),
     )
 
 

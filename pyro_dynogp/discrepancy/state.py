@@ -7,16 +7,15 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.discrepancy.context import SearchContext, Stopwatch, Tested, goes_with_inputs
+from pyro_dynogp.discrepancy.context import SearchContext, Stopwatch, Tested
 from pyro_dynogp.discrepancy.data_faults import data_spikes
 from pyro_dynogp.discrepancy.decision import Confirmed
 from pyro_dynogp.discrepancy.refits import quick_fit
 from pyro_dynogp.discrepancy.report import Attempt
 from pyro_dynogp.discrepancy.search import Candidate, Found, candidates_of
 from pyro_dynogp.discrepancy.trials import without
-from pyro_dynogp.effects import ProcessNoise
+from pyro_dynogp.effects.base import OUTSIDE
 from pyro_dynogp.models.variants import Model, has_process_noise
-from pyro_dynogp.report.words import OUTSIDE
 from pyro_dynogp.statistics.evidence import Residuals
 
 if TYPE_CHECKING:
@@ -39,7 +38,7 @@ class SearchState:
         first: fit of the model as given. plain: of that model without process noise.
         current: fit of the model so far. model: that model.
         hidden: in words, that process noise hides what is missing; empty where it does not.
-        waiting: process noise that is taken away until it costs nothing.
+        quiet: whether process noise is taken away until it costs nothing.
         returned: whether rounds began again with it.
         number: of rounds so far.
         accepted: effects in order. seen: residuals before each of them was added.
@@ -54,7 +53,7 @@ class SearchState:
     current: Fit = field(init=False)
     model: Model = field(init=False)
     hidden: str = field(init=False)
-    waiting: set[str] = field(default_factory=set)
+    quiet: bool = False
     returned: bool = False
     number: int = 0
     accepted: list[tuple[Found, Confirmed]] = field(default_factory=list)
@@ -71,7 +70,7 @@ class SearchState:
         self._go_on_from(self.first)
         if self.hidden and has_process_noise(self.first.model):
             self._go_on_from(self.plain)
-            self.waiting = {ProcessNoise.name}
+            self.quiet = True
 
     def go_round(self) -> bool:
         """Look, try what the residual speaks for, and add what helps; whether to go on."""
@@ -94,15 +93,17 @@ class SearchState:
             if confirmed.winner is not None and confirmed.model is not None:
                 self._add(confirmed.winner, confirmed, confirmed.model, looked)
                 return True
-        if not (self.left and self.waiting) or self.accepted:
+        if not (self.left and self.quiet) or self.accepted:
             return False
         self._go_on_from(self.first)
-        self.waiting, self.returned = set(), True
+        self.quiet, self.returned = False, True
         return True
 
     def look(self) -> Tested:
         """Test the residuals of the model so far."""
-        known = self.waiting | {one.effect.name for one, _ in self.accepted}
+        known = {one.effect.name for one, _ in self.accepted}
+        if self.quiet:
+            known |= {one.name for one in self.rounds.effects if one.absorbs_structure}
         # A function of the output that is there has its limits, too.
         known |= {one.name for one in self.rounds.effects if one.special_of in known}
         plain = None if self.accepted else self.plain
@@ -157,7 +158,7 @@ class SearchState:
         certain = [f.evidence.p_value for f in self.reported]
         return (
             bool(certain)
-            and goes_with_inputs(found.effect)
+            and found.effect.mimicked_by_feedback
             and found.evidence.p_value > min(certain)
         )
 
@@ -189,8 +190,8 @@ class SearchState:
         if fit is None or again:
             training = without(rounds.data.known, rounds.held_out)
             fit = quick_fit(larger, training, rounds.seed, self.current)
-        if self.waiting and (noisy := rounds.with_process_noise(fit)) is not None:
-            fit, self.waiting = noisy, set()
+        if self.quiet and (noisy := rounds.with_process_noise(fit)) is not None:
+            fit, self.quiet = noisy, False
         self._go_on_from(fit)
         self.watch.stop("refits")
 

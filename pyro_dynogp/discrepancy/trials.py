@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 from scipy.special import logsumexp
@@ -14,15 +13,12 @@ from pyro_dynogp.criticism.densities import pointwise_log_density
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.refits import energy, poles_of, quick_fit, race
 from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
+from pyro_dynogp.effects.base import Compared, Score
 from pyro_dynogp.inference.fitted import Fit
 from pyro_dynogp.models.delays import comparable
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.variants import Model
 from pyro_dynogp.prediction.first_state import beginning
-
-Score = Literal["one step", "forecast"]
-# Data on which variants of an effect are compared.
-Compared = Literal["training", "held out"]
 
 
 @dataclass(frozen=True)

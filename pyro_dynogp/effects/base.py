@@ -1,23 +1,38 @@
-"""What every effect has: names, how it is found, which blocks add it."""
+"""What every effect has: how it is detected, which blocks add it, what tells it from others."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 
 from pyro_dynogp.data.channels.base import Channel, signal_of
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.discrepancy.trials import Compared, Score
 from pyro_dynogp.models.variants import Model
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
 
+if TYPE_CHECKING:
+    from pyro_dynogp.inference.fitted import Fit
+
+# Densities on which an effect must pay.
+Score = Literal["one step", "forecast"]
+# Data on which variants of an effect are compared.
+Compared = Literal["training", "held out"]
+ActsOn = Literal["inputs", "time", "noise"]
+# Posterior mean and standard deviation of numbers by label, unit included.
+Parameters = dict[str, tuple[float, float]]
 Kind = TypeVar("Kind", bound=Channel)
 # Share of its estimate by which a limit or a width may be off, tried by refits, and then finer.
 AROUND = (0.75, 1.0, 1.3)
 FINER = ((0.88, 1.13), (0.95, 1.05))
+# In a tie, what products of inputs at two times, or responses that change with time, speak for.
+OUTSIDE = "a cause outside the catalogue"
+_OUTSIDE_EXPERIMENT = (
+    "the same input twice, at another time and at half the size: what is constant responds "
+    "alike, what is linear half as much"
+)
 
 
 class Effect:
@@ -26,31 +41,51 @@ class Effect:
     Attributes:
         name: of the effect. family: those that one cause may set off together.
         freedom: how much it leaves open; of two that explain the same, the one with less is kept.
-        localised: whether it happens at one instant, so that refits are scored on blocks of the
-            whole record rather than after it.
         score: on which densities it must pay: of forecasts, or one step ahead.
-        compared: on which data its variants are: those that are fitted to, or, where variants
-            differ in how they go on, those held out (the first that does as well as the best).
+        acts_on: what the test looks at. "inputs": responses of the output to inputs, looked for in
+            all data and in what the model leaves without its process noise, which takes up what
+            inputs do. "time" or "noise": looked for in the held-out residuals of the model as it
+            is, which follow both.
         special_of: name of an effect of which it is a special case; its own name is given only
             where the residual is certain of it.
         once: whether it is not looked for again in a model that has it.
         added: whether a block mends it; False for what is only reported.
+        localised: whether it happens at one instant, so that refits are scored on blocks of the
+            whole record rather than after it.
+        compared: on which data its variants are: those that are fitted to, or, where variants
+            differ in how they extrapolate, those held out (the first as good as the best).
+        absorbs_structure: whether its block takes up whatever else a model lacks, so that a search
+            begins without it.
+        experiments: by name of another effect, the experiment that tells the two apart. One of
+            the two effects need say so.
         test: finds evidence in residuals; a class whose test needs more overrides `detect`.
     """
 
     name: ClassVar[str] = ""
     family: ClassVar[str] = ""
     freedom: ClassVar[int] = 1
-    localised: ClassVar[bool] = False
     score: ClassVar[Score] = "forecast"
-    compared: ClassVar[Compared] = "training"
+    acts_on: ClassVar[ActsOn] = "time"
     special_of: ClassVar[str] = ""
     once: ClassVar[bool] = False
     added: ClassVar[bool] = True
+    localised: ClassVar[bool] = False
+    compared: ClassVar[Compared] = "training"
+    absorbs_structure: ClassVar[bool] = False
+    experiments: ClassVar[Mapping[str, str]] = {}
     test: ClassVar[Callable[..., Evidence | Sequence[Evidence]]]
 
+    @property
+    def mimicked_by_feedback(self) -> bool:
+        """Whether inputs that follow the output's disturbances may look like it."""
+        return self.acts_on == "inputs"
+
     def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
-        """Evidence for the effect, one for each channel it may come from; may be empty."""
+        """Evidence for the effect, one for each channel it may come from; may be empty.
+
+        Raises:
+            ValueError: where the residuals cannot be tested for it.
+        """
         return listed(self.test(residuals, seed=seed))
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
@@ -65,10 +100,39 @@ class Effect:
         """What it is, once the model has it; what the test said by default."""
         return evidence.sentence
 
+    def parameters(self, fit: Fit, evidence: Evidence, record: Record) -> Parameters:
+        """Posterior mean and standard deviation of numbers that are not those of its channels.
 
-def listed(found: Evidence | Sequence[Evidence]) -> Sequence[Evidence]:
-    """What a test found, as a sequence."""
-    return [found] if isinstance(found, Evidence) else found
+        Numbers of the channels that `extend` adds (their gains, and the fields that they list in
+        `numbers`) have a posterior without this. None more by default.
+
+        Args:
+            fit: of the extended model, to the record. evidence: that the effect was added for.
+            record: as measured, without the channels.
+        """
+        return {}
+
+
+def experiment(name: str, others: Sequence[str], effects: Collection[Effect]) -> str:
+    """Which experiment tells an effect from others; "" for no others.
+
+    Args:
+        name: of the effect. others: names of those that explain the data as well, or `OUTSIDE`.
+        effects: those that were looked for; they say which experiments tell them apart.
+    """
+    said = {(e.name, other): text for e in effects for other, text in e.experiments.items()}
+    texts = [said.get((name, other)) or said.get((other, name)) for other in others]
+    known = [text for text in texts if text]
+    if OUTSIDE in others:
+        known.append(_OUTSIDE_EXPERIMENT)
+    if known:
+        return "; ".join(dict.fromkeys(known))
+    return "a record with inputs for which their predictions differ" if others else ""
+
+
+def listed(evidence: Evidence | Sequence[Evidence]) -> Sequence[Evidence]:
+    """What a test returns, as a sequence."""
+    return [evidence] if isinstance(evidence, Evidence) else evidence
 
 
 def number_of(evidence: Evidence, key: str) -> float:

@@ -8,15 +8,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from pyro_dynogp.data.channels.clock import DAYS_A_YEAR, turn_of_the_year
-from pyro_dynogp.effects.clock_effects import clock_shift
-from pyro_dynogp.effects.clocks import all_zones, in_zone, stamps_of
+from pyro_dynogp.data.channels import Calendar
+from pyro_dynogp.data.channels.clock import DAY, DAYS_A_YEAR, turn_of_the_year
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.effects.base import Effect
+from pyro_dynogp.effects.clocks import ZONES, all_zones, in_zone, stamps_of
+from pyro_dynogp.models.variants import Model, with_channel, without_channel
 from pyro_dynogp.statistics.bootstrap import columns_score, replicates, sieve, spanning
 from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
 from pyro_dynogp.statistics.shares_of_inputs import own
 from pyro_dynogp.support.errors import invalid
-
-__all__ = ["calendar", "clock_shift"]
 
 # Days that must be looked at before a contrast is tried: fewer do not repeat it.
 DAYS_FOR_HOURS, DAYS_FOR_WEEK, DAYS_FOR_YEAR = 3, 14, 548
@@ -27,6 +28,11 @@ SEASONS = ("Dec-Feb", "Mar-May", "Jun-Aug", "Sep-Nov")
 OWN = 3.0
 # Contrasts of the year; the others are of the day and the week.
 YEARLY = ("season", "time of year", "turn of the year")
+# Parts of the calendar under the names of the channel that stands for them.
+CALENDAR_PARTS = {
+    "hour of day by weekday/weekend": "hour of day by weekend",
+    "season": "time of year",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +168,14 @@ def _in_zone(local: pd.DatetimeIndex, zone: str, days: int) -> tuple[list[Contra
     K = max(len(np.unique(hour)) - 1, 1)
     contrasts, blocks = list[Contrast](), list[np.ndarray]()
 
-    def add(what: str, degrees: int, new: np.ndarray, groups, labels, also=()) -> None:
+    def add(
+        what: str,
+        degrees: int,
+        new: np.ndarray,
+        groups: np.ndarray,
+        labels: Sequence[str],
+        also: Sequence[int] = (),
+    ) -> None:
         first = sum(b.shape[1] for b in blocks)
         blocks.append(new)
         columns = (*also, *range(first, first + new.shape[1]))
@@ -204,3 +217,48 @@ def _averages(r: Residuals, best: Contrast, x: np.ndarray, fitted: np.ndarray) -
         x_label=f"{best.what}, {best.zone}",
         y_label=f"residual of {r.output_name} [{r.output_unit}]",
     )
+
+
+class CalendarEffect(Effect):
+    """Hours, weekdays or seasons, for records with time stamps.
+
+    Args:
+        zones: IANA zones on whose clocks the calendar may run, beside that of the stamps.
+    """
+
+    name = "calendar"
+    family = "time"
+    freedom = 3
+
+    def __init__(self, zones: Sequence[str] = ZONES) -> None:
+        self.zones = tuple(zones)
+
+    def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
+        """One of the day and the week, and one of the year where the record is long enough."""
+        if residuals.stamps is None:
+            return []
+        return calendar(residuals, zones=self.zones, seed=seed)
+
+    def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
+        """The part of the calendar as direct inputs; or all that the model has, on that clock.
+
+        In place of the same part, if the model has it: with twice the harmonics if on that clock,
+        as far as the steps of the record tell harmonics of a day apart.
+        """
+        what, zone = str(evidence.where["what"]), str(evidence.where["zone"])
+        part = CALENDAR_PARTS.get(what, what)
+        there = [one for one in model.channels if isinstance(one, Calendar)]
+        harmonics, plain = 3 if part == "time of year" else 6, model
+        for one in there:
+            if one.what == part:
+                plain = without_channel(plain, one)
+                harmonics = max(harmonics, one.harmonics * (2 if one.zone == zone else 1))
+        if part != "time of year":
+            harmonics = max(1, min(harmonics, int(0.5 * DAY / record.sampling_time)))
+        variants = [with_channel(plain, Calendar(part, zone, harmonics))]
+        if any(one.zone != zone for one in there):
+            channels = tuple(
+                replace(c, zone=zone) if isinstance(c, Calendar) else c for c in model.channels
+            )
+            variants.append(replace(model, channels=channels))
+        return variants

@@ -12,6 +12,11 @@ from pyro_dynogp.statistics.responses import responses
 from pyro_dynogp.statistics.shares_of_inputs import paths
 from pyro_dynogp.support.errors import invalid
 
+# One zone for each common rule of daylight saving: clocks tell zones apart by their transitions.
+ZONES = (
+    "UTC", "Europe/Berlin", "America/New_York", "America/Santiago", "Australia/Melbourne",
+    "Pacific/Auckland",
+)  # fmt: skip
 # A channel is a clock where what is left of it within equal times of day is less than this share.
 EXACT = 1e-9
 # A share below this part of the largest one is none.

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
+
+from pyro_dynogp.data.record import Record
 
 # Lags of the output and of each input in the regression, and how many delays are kept.
 PAST, LAGS, KEPT = 4, 4, 3
@@ -50,3 +52,16 @@ def likely_delays(
     around = np.concatenate([[np.inf], left, [np.inf]])
     low = np.flatnonzero((left <= around[:-2]) & (left <= around[2:]))
     return [int(d) for d in low[np.argsort(left[low], kind="stable")][:KEPT]]
+
+
+def resolved(delays: Iterable[float], record: Record) -> list[float]:
+    """Delays that a record can tell apart: on an even clock whole samples, one at least.
+
+    A held input that arrives within a sample is, at the samples, one that arrives with the next and
+    acts with another numerator: x[k+1] = phi x[k] + g1 u[k] + g2 u[k+1] for every fraction of it
+    (Franklin, Powell & Workman, Digital Control of Dynamic Systems, 3rd ed., section 4.3).
+    """
+    if not record.is_regular:
+        return sorted(delays)
+    step = record.sampling_time
+    return [step * count for count in sorted({max(round(one / step), 1) for one in delays})]

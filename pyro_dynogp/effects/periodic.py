@@ -2,31 +2,27 @@
 
 from __future__ import annotations
 
-import numpy as np
-from scipy.fft import fft, next_fast_len, rfft
-from scipy.optimize import minimize_scalar
-from scipy.stats import chi2
+from collections.abc import Sequence
 
-from pyro_dynogp.statistics.bootstrap import (
-    Prepare,
-    Score,
-    explained_by,
-    log_ratio,
-    projector,
-    replicates,
-    sieve,
-    spanning,
-)
+import numpy as np
+from scipy.fft import next_fast_len
+
+from pyro_dynogp.data.channels import Sinusoid
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.effects.base import Effect, changed, number_of, unit_of
+from pyro_dynogp.effects.periodic_lines import harmonics, lines, refined, slots
+from pyro_dynogp.models.variants import Model, with_channel
+from pyro_dynogp.statistics.bootstrap import replicates, sieve, spanning
 from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
 from pyro_dynogp.statistics.shares_of_inputs import own
 from pyro_dynogp.statistics.time_pictures import size_in_words
-from pyro_dynogp.statistics.whitening import Whitener
 from pyro_dynogp.support.errors import invalid
 
 # A period is at least this often in what is looked at; slower is drift. Grid of frequencies: so
 # many for each 1 / duration.
 CYCLES, OVERSAMPLING = 3.0, 4
-HARMONICS = 4
+# Shares of its resolution by which a period is moved to refine it, first and then.
+NEARER = ((-0.1, -0.05, 0.05, 0.1), (-0.03, 0.03))
 
 
 def periodic_disturbance(residuals: Residuals, *, seed: int = 0) -> Evidence:
@@ -53,7 +49,7 @@ def periodic_disturbance(residuals: Residuals, *, seed: int = 0) -> Evidence:
     residual; the largest over frequencies as in Fisher, Proc. R. Soc. A 125:54 (1929).
     """
     r = residuals
-    at = _slots(r)
+    at = slots(r)
     n = int(at[-1]) + 1
     x = np.full(n, np.nan)
     x[at] = r.residual
@@ -69,21 +65,21 @@ def periodic_disturbance(residuals: Residuals, *, seed: int = 0) -> Evidence:
     nuisance = spanning(nuisance)
     length = next_fast_len(OVERSAMPLING * span, real=True)
     bins = np.arange(int(np.ceil(CYCLES * length / span)), length // 2)
-    lines = _lines(bins, length, nuisance, ~np.isfinite(x))
+    prepare = lines(bins, length, nuisance, ~np.isfinite(x))
     deviations = np.zeros((len(r.deviations), span))
     deviations[:, at[kept] - looked[0]] = r.deviations[:, kept]
     found = sieve(
         x,
-        lines,
+        prepare,
         np.full(len(bins), 2.0),
         deviations=deviations,
         joint=True,
         replicates=replicates(span, 2 * nuisance.shape[1]),
         seed=seed,
     )
-    frequency = _refined(found.whitener, x, nuisance, bins[found.best] / length, 1.0 / length)
+    frequency = refined(found.whitener, x, nuisance, bins[found.best] / length, 1.0 / length)
     period = r.step / frequency
-    effect, also = _harmonics(found.whitener, x, nuisance, frequency)
+    effect, also = harmonics(found.whitener, x, nuisance, frequency)
     size = float(np.sqrt(np.mean(effect**2)))
     more = f", with harmonics {', '.join(map(str, also))}" if also else ""
     return Evidence(
@@ -97,136 +93,6 @@ def periodic_disturbance(residuals: Residuals, *, seed: int = 0) -> Evidence:
         f"{more}: {size_in_words(r, size)}.",
         curve=_folded(r, x, effect, period),
     )
-
-
-def _slots(r: Residuals) -> np.ndarray:
-    """Number of each sample (n,) on the clock of equal steps."""
-    exact = (r.time - r.time[0]) / r.step
-    at = np.round(exact).astype(int)
-    if np.abs(exact - at).max() > 0.1 or (np.diff(at) < 1).any():
-        raise invalid(
-            "residuals",
-            expected="equal steps, or multiples of one step",
-            got="irregular ones",
-            advice="Resample the record; missing samples may be NaN.",
-        )
-    return at
-
-
-def _lines(bins: np.ndarray, length: int, nuisance: np.ndarray, missing: np.ndarray) -> Prepare:
-    """Score of sines at frequencies bins / length [1 / step]: all by one Fourier transform.
-
-    A filter makes of a sine a sine of the same frequency, so both span the same, and the
-    residual's own past stands beside it as more columns of nuisance.
-    """
-
-    def prepare(whiten: Whitener) -> Score:
-        p, n = whiten.order, len(missing)
-        there = ~missing
-        for k in range(1, p + 1):
-            there[k:] &= ~missing[: n - k]
-            there[:k] = False
-        rows = np.flatnonzero(there)
-        beside = spanning(nuisance[rows])
-        mask = there.astype(float)
-        double = fft(mask, length)[(2 * bins) % length]
-
-        def parts(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            full = np.zeros((values.shape[1], n))
-            full[:, rows] = values.T
-            F = rfft(full, length, axis=1)[:, bins]
-            return F.real, -F.imag
-
-        def score(x: np.ndarray):
-            past = [x[rows - k] for k in range(1, p + 1)]
-            Q = np.linalg.qr(np.column_stack([beside, *past]))[0]
-            e = x[rows] - Q @ (Q.T @ x[rows])
-            C, S = parts(np.column_stack([e, Q]))
-            c, s, C, S = C[0], S[0], C[1:], S[1:]
-            cc = 0.5 * (len(rows) + double.real) - np.square(C).sum(0)
-            ss = 0.5 * (len(rows) - double.real) - np.square(S).sum(0)
-            cs = -0.5 * double.imag - (C * S).sum(0)
-            determinant = cc * ss - cs**2
-            usable = determinant > 1e-6 * len(rows) ** 2
-            explained = (ss * c**2 - 2.0 * cs * c * s + cc * s**2) / np.where(
-                usable, determinant, 1.0
-            )
-            samples = len(e) - Q.shape[1]
-            gains = samples * log_ratio(np.where(usable, explained, 0.0), float(e @ e))
-
-            def fit(j: int) -> tuple[np.ndarray, np.ndarray]:
-                line = _wave(n, bins[j] / length)
-                design = np.column_stack([*past, line[rows], nuisance[rows]])
-                own_filter = Whitener(np.linalg.lstsq(design, x[rows], rcond=1e-9)[0][:p])
-                return explained_by(own_filter, there[p:], line, nuisance, x)
-
-            return gains, fit
-
-        return score
-
-    return prepare
-
-
-def _sine(n: int, frequency: float) -> np.ndarray:
-    """Cosine and sine (n, 2) of a frequency [1 / step]."""
-    angle = 2.0 * np.pi * frequency * np.arange(n)
-    return np.column_stack([np.cos(angle), np.sin(angle)])
-
-
-def _wave(n: int, frequency: float) -> np.ndarray:
-    """Sines of a frequency and its harmonics, and how they change with it (n, K).
-
-    Of a strong line what a grid of frequencies misses, and what its harmonics are, would still look
-    like colour, which a filter of high order explains.
-    """
-    shift = np.linspace(-1.0, 1.0, n)[:, None]
-    # At half the sampling rate a sine is nothing, and next to it is nearly what a cosine becomes.
-    inside = [h * frequency for h in range(1, HARMONICS + 1) if h * frequency < 0.5 - 2.0 / n]
-    waves = [_sine(n, f) for f in inside] or [_sine(n, frequency)]
-    return np.column_stack([*waves, *(shift * wave for wave in waves if inside)])
-
-
-def _refined(
-    whiten: Whitener, x: np.ndarray, nuisance: np.ndarray, frequency: float, width: float
-) -> float:
-    """Frequency of largest gain within `width` of one on the grid [1 / step]."""
-    there, Q, _ = projector(whiten, nuisance, ~np.isfinite(x))
-    e = whiten(x)[there]
-    e = e - Q @ (Q.T @ e)
-
-    def left(f: float) -> float:
-        w = whiten(_sine(len(x), f))[there]
-        w = w - Q @ (Q.T @ w)
-        return -float(e @ w @ np.linalg.lstsq(w, e, rcond=1e-9)[0])
-
-    bounds = (max(frequency - width, 0.1 / len(x)), min(frequency + width, 0.5))
-    return float(minimize_scalar(left, bounds=bounds, method="bounded").x)
-
-
-def _harmonics(
-    whiten: Whitener, x: np.ndarray, nuisance: np.ndarray, frequency: float
-) -> tuple[np.ndarray, list[int]]:
-    """The sine with those harmonics that explain more at 1 % (n,), and which they are."""
-    there = np.isfinite(whiten(x))
-    columns, also, n = _sine(len(x), frequency), list[int](), len(x)
-
-    def total(columns: np.ndarray) -> float:
-        joined = whiten(np.column_stack([columns, nuisance]))[there]
-        e = whiten(x)[there]
-        return float(np.square(e - joined @ np.linalg.lstsq(joined, e, rcond=1e-9)[0]).sum())
-
-    known, last = int(there.sum()), total(columns)
-    for h in range(2, HARMONICS + 1):
-        if h * frequency >= 0.5:
-            break
-        more = np.column_stack([columns, _sine(n, h * frequency)])
-        left = total(more)
-        if chi2.sf(known * np.log(max(last, 1e-300) / max(left, 1e-300)), 2) < 0.01 / (
-            HARMONICS - 1
-        ):
-            columns, last = more, left
-            also.append(h)
-    return explained_by(whiten, there, columns, nuisance, x)[0], also
 
 
 def _folded(r: Residuals, x: np.ndarray, effect: np.ndarray, period: float) -> Curve:
@@ -247,3 +113,45 @@ def _folded(r: Residuals, x: np.ndarray, effect: np.ndarray, period: float) -> C
         x_label=f"time within the period [{r.time_unit}]",
         y_label=f"residual of {r.output_name} [{r.output_unit}]",
     )
+
+
+class PeriodicDisturbance(Effect):
+    """A line that no input explains."""
+
+    name = "periodic disturbance"
+    family = "time"
+    freedom = 4  # its period is free, where the calendar's are known
+    test = staticmethod(periodic_disturbance)
+
+    def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
+        """A sinusoid of the period, and of periods within its resolution.
+
+        Or of two and three times the period: process noise may have taken the fundamental, and the
+        residual has a harmonic only.
+        """
+        period = number_of(evidence, "period")
+        width = period**2 / record.duration
+        waves = [Sinusoid(period + share * width, 1) for share in (-0.2, -0.1, 0.0, 0.1, 0.2)]
+        waves.append(Sinusoid(period, 3))
+        # What does not come twice in a record is a drift.
+        waves += [Sinusoid(k * period, k) for k in (2, 3) if 2 * k * period <= record.duration]
+        return [with_channel(model, wave) for wave in waves]
+
+    def refine(self, model: Model, record: Record, times: int) -> Sequence[Model]:
+        """The period a little shorter and longer, in shares of its resolution."""
+        wave = model.channels[-1]
+        assert isinstance(wave, Sinusoid)
+        width = wave.period**2 / record.duration
+        return [
+            changed(model, [wave], period=wave.period + share * width) for share in NEARER[times]
+        ]
+
+    def sentence(self, evidence: Evidence, model: Model) -> str:
+        """The period as refits have it."""
+        wave = model.channels[-1]
+        assert isinstance(wave, Sinusoid)
+        several = f" and {wave.harmonics} harmonics" if wave.harmonics > 1 else ""
+        return (
+            f"A disturbance of {evidence.where['output']!r} with a period of "
+            f"{wave.period:.4g}{unit_of(evidence)}{several}."
+        )

@@ -1,12 +1,20 @@
-"""An output that stops at a limit."""
+"""A sensor that clips: an output that stops at a limit."""
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
+from scipy import stats
+from scipy.signal import lfilter
 
-from pyro_dynogp.effects.ties import Ties, ties_at_the_top
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.effects.base import Effect, Parameters, number_of
+from pyro_dynogp.models.variants import Model, with_output_function
+from pyro_dynogp.models.wiring import Static
+from pyro_dynogp.statistics.autoregression import fitted_filter
 from pyro_dynogp.statistics.detecting import (
     NOTICED,
     about,
@@ -20,6 +28,10 @@ from pyro_dynogp.statistics.detecting import (
 )
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
 from pyro_dynogp.statistics.regression import with_past
+from pyro_dynogp.statistics.scan import tail_probability
+
+if TYPE_CHECKING:
+    from pyro_dynogp.inference.fitted import Fit
 
 # Exact ties as improbable as this are a limit, and name it.
 TIED = 0.01
@@ -27,6 +39,8 @@ TIED = 0.01
 FLAT = 0.3
 # Quantiles of the mean above which it may flatten; below, their complements.
 UPPER = np.array([0.5, 0.6, 0.7, 0.8, 0.9, 0.95])
+# Values as near as this to each other, against the range, are the same number.
+SAME = 1e-9
 
 
 def saturation(residuals: Residuals, *, seed: int = 0) -> Evidence:
@@ -42,7 +56,7 @@ def saturation(residuals: Residuals, *, seed: int = 0) -> Evidence:
     r = residuals
     top = ties_at_the_top(r.output, r.mean, seed=seed)
     bottom = ties_at_the_top(-r.output, -r.mean, seed=seed)
-    bottom = dataclasses.replace(bottom, limit=-bottom.limit)
+    bottom = replace(bottom, limit=-bottom.limit)
     tied = min(1.0, 2.0 * min(top.p_value, bottom.p_value))
     knots = _knots(r.mean)
     found = of_positive_weight(
@@ -54,7 +68,7 @@ def saturation(residuals: Residuals, *, seed: int = 0) -> Evidence:
         low = bottom.limit if bottom.p_value < TIED or bottom.p_value < top.p_value else -np.inf
         high = top.limit if top.p_value < TIED or top.p_value <= bottom.p_value else np.inf
         gain = -float(np.log(max(tied, 1e-300)))
-        found = dataclasses.replace(
+        found = replace(
             found,
             statistic=(2.0 * gain - 1.0) / np.sqrt(2.0),
             gain=gain,
@@ -70,7 +84,7 @@ def saturation(residuals: Residuals, *, seed: int = 0) -> Evidence:
     flattened = np.clip(r.mean, low, high)
     return evidence(
         "saturation",
-        dataclasses.replace(found, p_value=p),
+        replace(found, p_value=p),
         {"low": low, "high": high},
         f"'{r.output_name}' stops at {' and '.join(limits)}{how}{about(r, found)}.",
         binned(
@@ -123,3 +137,122 @@ def _cut(top: Ties, bottom: Ties, low: float, high: float) -> float:
     """Root mean square of what limits cut off."""
     sizes = [t.size for t, at in ((bottom, low), (top, high)) if np.isfinite(at)]
     return float(np.sqrt(np.square(sizes).sum()))
+
+
+@dataclass(frozen=True)
+class Ties:
+    """Samples at the largest value.
+
+    Attributes:
+        limit: that value [output]. count: of samples there.
+        p_value: probability of as many were there no limit.
+        size: root mean square of what is cut off, by the mean [output].
+    """
+
+    limit: float
+    count: int
+    p_value: float
+    size: float
+
+
+def ties_at_the_top(
+    output: np.ndarray, mean: np.ndarray, *, replicates: int = 200, seed: int = 0
+) -> Ties:
+    """Test whether more samples are at the largest value than the model has there.
+
+    Under the null the record is mean plus residual (its innovations in random order through the
+    autoregressive filter), rounded to the record's own resolution: a slow record of few digits
+    has ties at each of its peaks without any limit.
+
+    Args:
+        output: (n,) measured, NaN where missing [output]. mean: (n,) [output].
+        replicates: of the null. seed: of their random order.
+
+    Raises:
+        ValueError: where fewer than 30 samples are measured.
+    """
+    there = np.isfinite(output) & np.isfinite(mean)
+    y = output[there]
+    top, spread = float(y.max(initial=-np.inf)), float(np.ptp(y)) if len(y) else 0.0
+    count = int((y >= top - SAME * spread).sum())
+    over = np.maximum(mean[there] - top, 0.0)
+    size = float(np.sqrt(np.mean(over**2)))
+    if count < 3 or spread == 0:
+        return Ties(top, count, 1.0, size)
+    residual = np.where(there, output - mean, np.nan)
+    whiten = fitted_filter(residual)
+    q = _resolution(y, spread)
+    e = whiten(residual)
+    e = e[np.isfinite(e)]
+    generator = np.random.default_rng(seed)
+    drawn = generator.choice(e, size=(replicates, there.size + 50))
+    noise = lfilter([1.0], np.concatenate([[1.0], -whiten.coefficients]), drawn, axis=1)[:, 50:]
+    made = (mean + noise)[:, there]
+    if q > 0:
+        made = np.round((made - top) / q)
+    null = (made >= made.max(1, keepdims=True)).sum(1).astype(float)
+    # Most records have one sample at their maximum: a distribution of counts has a tail, too.
+    p = max(tail_probability(null, count), float(stats.poisson.sf(count - 2, max(null.mean(), 1))))
+    if null.std() == 0:
+        p = float(stats.poisson.sf(count - 2, 1.0))
+    return Ties(top, count, min(1.0, p), size)
+
+
+def _resolution(y: np.ndarray, spread: float) -> float:
+    """Step to which values are rounded, zero where they are not."""
+    distinct = np.unique(np.round(y / (SAME * spread)))
+    gaps = np.diff(distinct) * SAME * spread
+    if len(distinct) > 0.8 * len(y) or not len(gaps):
+        return 0.0
+    q = float(gaps.min())
+    steps = gaps / q
+    return q if np.abs(steps - np.round(steps)).max() < 0.05 else 0.0
+
+
+class Saturation(Effect):
+    """A sensor that clips."""
+
+    name = "saturation"
+    family = "shapes"
+    acts_on = "inputs"
+    special_of = "output nonlinearity"
+    once = True
+    experiments: ClassVar = {
+        "output nonlinearity": "inputs that hold the output beyond the suspected limit",
+    }
+    test = staticmethod(saturation)
+
+    def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
+        """A static layer at the output whose prior mean stops at the limits."""
+        low, high = (
+            at if np.isfinite(at := number_of(evidence, end)) else None for end in ("low", "high")
+        )
+        # Which of several outputs the limits are of is not said, and what acts on the output
+        # directly comes on top of the sensor.
+        if model.outputs > 1 or model.direct:
+            low = high = None
+        limits = None if low is None and high is None else (low, high)
+        extended = with_output_function(model, limits)
+        return [] if extended is None else [extended]
+
+    def parameters(self, fit: Fit, evidence: Evidence, record: Record) -> Parameters:
+        """Limits of the sensor: its function where that is highest, or lowest.
+
+        Posterior mean and standard deviation of the function [output] where it is best known of
+        where it is at its limit to within a standard deviation; of the limits in the evidence.
+        """
+        if not isinstance(fit.model.layers[-1], Static):
+            return {}
+        band = fit.static_function(fit.model.wires[-1].name, record)
+        seen = (band.x >= band.inputs.min()) & (band.x <= band.inputs.max())
+        mean, sd = band.mean[seen, 0], band.sd[seen, 0]
+        scale, offset = fit.scaling.output_scale[0], fit.scaling.output_offset[0]
+        limits: Parameters = {}
+        for end, name, sign in (("low", "lower limit", -1.0), ("high", "upper limit", 1.0)):
+            if np.isfinite(number_of(evidence, end)):
+                top = int((sign * mean).argmax())
+                flat = sign * mean >= sign * mean[top] - sd[top]
+                at = int(np.where(flat, sd, np.inf).argmin())
+                label = labelled(name, fit.scaling.output_units[0])
+                limits[label] = float(offset + scale * mean[at]), float(scale * sd[at])
+        return limits

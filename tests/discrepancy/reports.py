@@ -6,15 +6,19 @@ import numpy as np
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.report import Attempt, FoundEffect, Report
+from pyro_dynogp.models.description import Part
 from pyro_dynogp.prediction.prediction import Prediction
 from pyro_dynogp.statistics.evidence import Curve, Evidence
 
-GIVEN = ("Inputs: valve [V]", "Dynamics: 3 pairs of poles, process noise", "Noise: Gaussian")
+GIVEN = (
+    Part("inputs", "Inputs", "valve [V]", separator=": "),
+    Part("dynamics", "Dynamics", "3 pairs of poles, process noise", separator=": "),
+    Part("noise", "Noise", "Gaussian", joins=True, separator=": "),
+)
 EXTENDED = (
-    "Inputs: valve [V], delayed by 2.1 s",
-    "Extra input: ambient [°C]",
-    "Dynamics: 3 pairs of poles, process noise",
-    "Noise: Gaussian",
+    Part("inputs", "Inputs", "valve [V], delayed by 2.1 s", separator=": "),
+    Part("extra input", "Extra input", "ambient [°C]", joins=True, separator=": "),
+    *GIVEN[1:],
 )
 EXPERIMENT = "step the valve while the ambient temperature is constant."
 

@@ -128,6 +128,7 @@ class SquaredInput(effects.Effect):
 
     name = "squared input"
     family = "shapes"
+    acts_on = "inputs"
 
     def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
         u = residuals.inputs[:, 0] - residuals.inputs[:, 0].mean()

@@ -17,7 +17,8 @@ from pyro_dynogp.data.channels import (
     Step,
 )
 from pyro_dynogp.data.signals import dead_zone, delayed, play
-from pyro_dynogp.discrepancy.parameters import limits_of, parameters_of
+from pyro_dynogp.discrepancy.parameters import parameters_of
+from pyro_dynogp.effects import OutputNonlinearity, Saturation
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.optimise.maximum import maximise
 from pyro_dynogp.models.variants import with_channel
@@ -202,12 +203,12 @@ def test_limits_of_a_sensor():
     model = dgp.Wiener(1, pairs=1, inducing=16, process_noise=False)
     fit = dgp.fit(model, record, restarts=2, steps=150, workers=1, progress=False)
     nothing = np.inf
-    found = limits_of(fit, evidence_of({"low": -nothing, "high": 0.61}), record)
+    found = Saturation().parameters(fit, evidence_of({"low": -nothing, "high": 0.61}), record)
     ((label, (mean, sd)),) = found.items()
     assert label == "upper limit [rpm]"
     assert mean == pytest.approx(0.6, abs=4.0 * sd + 0.01)
     assert 0.0 < sd < 0.05
-    assert limits_of(fit, evidence_of({}, "output nonlinearity"), record) == {}
+    assert OutputNonlinearity().parameters(fit, evidence_of({}), record) == {}
 
 
 def evidence_of(where, effect="saturation"):

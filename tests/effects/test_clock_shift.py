@@ -1,6 +1,6 @@
-"""A clock that is off: its instant and shift as refits find them, its rule, forecasts across it."""
+"""A clock that is off: its instant and shift, its rule, forecasts across it."""
 
-from __future__ import annotations
+import dataclasses
 
 import numpy as np
 import pandas as pd
@@ -11,14 +11,66 @@ from pyro_dynogp import effects
 from pyro_dynogp.data.channels import ShiftedClock
 from pyro_dynogp.discrepancy.refits import quick_fit
 from pyro_dynogp.discrepancy.trials import Trial, run
-from pyro_dynogp.effects.times import seasons
+from pyro_dynogp.effects.clock_shift import clock_shift, seasons
 from pyro_dynogp.models.variants import with_channel
 from tests.discrepancy.made import coloured
 from tests.discrepancy.plant_dynamics import System, response
+from tests.discrepancy.series import residuals, share
 from tests.discrepancy.test_decision import spoken_for
+from tests.effects.scenes import MELBOURNE, daylight_saving, stamps
 
 N, STEP, FIRST, LATE, NOISE = 500, 1200.0, 180, 3, 0.05
 MODEL = dgp.LinearDynamicGP(1, pairs=1)
+
+
+class TestClockShift:
+    @pytest.mark.parametrize(("channel", "shift"), [(0, 1.5), (1, 1.5), (1, -1.0)])
+    def test_shift_is_found(self, channel, shift):
+        def effect(t, mean, u):
+            own = share(u[:, channel], channel + 1.0)
+            return np.where(t >= 90.0, np.interp(t + shift, t, own) - own, 0.0)
+
+        found = clock_shift(residuals(3, 400, inputs=2, effect=effect))
+        assert found.p_value < 1e-4
+        assert found.where["channel"] == f"u{channel + 1}"
+        assert found.where["shift"] == pytest.approx(shift, abs=0.2)
+        assert found.where["time"] == pytest.approx(90.0, abs=4.0)
+
+    def test_daylight_saving_is_found(self):
+        found = clock_shift(daylight_saving(1), zones=("Europe/Berlin", MELBOURNE))
+        assert found.p_value < 1e-4
+        assert found.where == {
+            "channel": "hour", "rule": MELBOURNE, "season": "summers", "shift": 1.0, "time": 352.0,
+            "time_unit": "s", "stamp": "2023-04-01T16:00:00+00:00", "zone": "UTC",
+        }  # fmt: skip
+
+    @pytest.mark.parametrize("shift", [2.0, -2.0])
+    def test_what_a_summer_takes_for_right_is_off_in_winters(self, shift):
+        # Steps of half an hour: an hour is two.
+        def effect(t, mean, u):
+            own = share(u[:, 0], 1.0)
+            return np.where(t >= 352.0, np.interp(t + 0.5 * shift, t, own) - own, 0.0)
+
+        r = residuals(3, 1200, step=0.5, effect=effect)
+        r = dataclasses.replace(r, stamps=stamps(1200, "30min"))
+        found = clock_shift(r, zones=(MELBOURNE,))
+        assert found.p_value < 1e-4
+        assert (found.where["rule"], found.where["season"]) == (MELBOURNE, "winters")
+        assert found.where["shift"] == pytest.approx(0.5 * shift)
+        assert "in the winters of Australia/Melbourne" in found.sentence
+
+    def test_shift_of_the_whole_record_is_a_dead_time(self):
+        def late(t, mean, u):
+            return np.interp(t - STEP, t, mean) - mean
+
+        STEP = 0.5
+        found = clock_shift(residuals(0, 400, effect=late))
+        assert found.p_value > 0.01
+
+    def test_there_must_be_an_input(self):
+        r = residuals(0)
+        with pytest.raises(ValueError, match="an input"):
+            clock_shift(dataclasses.replace(r, inputs=r.inputs[:, :0], input_names=()))
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from pyro_dynogp.report import figures as plotting
+from pyro_dynogp.report import figures
 from pyro_dynogp.statistics.evidence import Evidence
 from tests.discrepancy import reports
 
@@ -23,7 +23,7 @@ def test_evidence():
     curve = reports.curve()
     shuffled = np.random.default_rng(0).permutation(25)
     mixed = reports.curve(x=curve.x[shuffled], y=curve.y[shuffled], fitted=curve.fitted[shuffled])
-    (axes,) = plotting.evidence(reports.effect(curve=mixed)).axes
+    (axes,) = figures.evidence(reports.effect(curve=mixed)).axes
     for label, y in (("data", curve.y), ("fitted effect", curve.fitted)):
         np.testing.assert_array_equal(line(axes, label), (curve.x, y))
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("ambient [°C]", "residual [m]")
@@ -31,21 +31,21 @@ def test_evidence():
 
 
 def test_evidence_without_a_fitted_effect_or_points():
-    figure = plotting.evidence(reports.delay())
+    figure = figures.evidence(reports.delay())
     (axes,) = figure.axes
     assert [one.get_label() for one in axes.lines] == ["data"]
     assert axes.lines[0].get_linestyle() == "-"
     assert not figure.legends
-    plotting.evidence(Evidence("drift", 3.0, 0.1, 2.0, 0.1, curve=reports.curve()))
+    figures.evidence(Evidence("drift", 3.0, 0.1, 2.0, 0.1, curve=reports.curve()))
     nothing = reports.curve(y=np.full(25, np.nan))
     for curve in (None, nothing):
         with refused("effect", "'extra input' without points"):
-            plotting.evidence(reports.effect(curve=curve))
+            figures.evidence(reports.effect(curve=curve))
 
 
 def test_forecasts_before_and_after():
     report = reports.report()
-    before, after = plotting.before_after(report).axes
+    before, after = figures.before_after(report).axes
     for axes, made, scores in (
         (before, report.forecast_before, report.before),
         (after, report.forecast_after, report.after),
@@ -60,15 +60,15 @@ def test_forecasts_before_and_after():
         assert band.min() == pytest.approx(made.quantile(0.025).min(), rel=1e-9)
         assert band.max() == pytest.approx(made.quantile(0.975).max(), rel=1e-9)
     assert before.get_ylim() == after.get_ylim()
-    part = plotting.before_after(report, slice(10, 30))
+    part = figures.before_after(report, slice(10, 30))
     np.testing.assert_array_equal(line(part.axes[0], "measured")[0], report.sealed.time[10:30])
     with refused("part", "empty"):
-        plotting.before_after(report, slice(10, 10))
+        figures.before_after(report, slice(10, 10))
 
 
 def test_residuals_have_one_scale_and_their_size():
     report = reports.report(outputs=2)
-    axes = plotting.residuals_before_after(report).axes
+    axes = figures.residuals_before_after(report).axes
     assert len(axes) == 4
     assert axes[0].get_ylim() == axes[1].get_ylim()
     assert axes[2].get_ylim() == axes[3].get_ylim() != axes[0].get_ylim()
@@ -79,8 +79,8 @@ def test_residuals_have_one_scale_and_their_size():
 
 def test_one_panel_where_nothing_was_added():
     report = reports.nothing()
-    assert len(plotting.before_after(report).axes) == 1
-    assert len(plotting.residuals_before_after(report).axes) == 1
+    assert len(figures.before_after(report).axes) == 1
+    assert len(figures.residuals_before_after(report).axes) == 1
 
 
 def test_a_long_record_keeps_its_extremes_and_gaps():
@@ -90,8 +90,8 @@ def test_a_long_record_keeps_its_extremes_and_gaps():
     y[12_345] = 9.0
     report = reports.report(80_000, sealed=report.sealed.with_outputs(y))
     for axes in (
-        *plotting.before_after(report).axes,
-        *plotting.residuals_before_after(report).axes,
+        *figures.before_after(report).axes,
+        *figures.residuals_before_after(report).axes,
     ):
         drawn = axes.lines[-1] if axes.lines[-1].get_label() == "measured" else axes.lines[0]
         x, shown = np.asarray(drawn.get_xdata()), np.asarray(drawn.get_ydata())
@@ -106,4 +106,4 @@ def test_forecasts_of_other_times():
     report = reports.report()
     other = reports.prediction(report.known)
     with refused("report.forecast_after", "sealed block", "300 times"):
-        plotting.before_after(reports.report(forecast_after=other))
+        figures.before_after(reports.report(forecast_after=other))

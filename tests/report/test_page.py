@@ -9,6 +9,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import pyro_dynogp as dgp
+from pyro_dynogp.data.channels import Delayed, Recorded, Step, Trend
+from pyro_dynogp.models.description import Part, describe
+from pyro_dynogp.models.variants import with_channel, with_likelihood, with_output_function
 from pyro_dynogp.report.html.diagram import diagram, marks
 from pyro_dynogp.report.html.html import number, plus_minus, probability
 from pyro_dynogp.report.html.page import _headline, page
@@ -156,8 +160,9 @@ def test_names_of_users_files():
     source, found = checked(
         reports.report(
             known=known, sealed=sealed, forecast_before=forecast, forecast_after=forecast,
-            effects=(evil,), warnings=(EVIL,), data=EVIL, model_before=(EVIL,),
-            model_after=(EVIL, EVIL * 3), tests={EVIL: (0.1, 0.2)}, seconds={EVIL: 1.0},
+            effects=(evil,), warnings=(EVIL,), data=EVIL, model_before=(Part(EVIL, EVIL),),
+            model_after=(Part(EVIL, EVIL), Part("long", EVIL * 3)),
+            tests={EVIL: (0.1, 0.2)}, seconds={EVIL: 1.0},
             attempts=(reports.attempt(1, EVIL, 0.01, "rejected", EVIL),
                       reports.attempt(1, EVIL, 0.1, "not tried", EVIL)),
         )
@@ -264,16 +269,18 @@ def test_words_of_changes():
 
 
 def test_marks():
-    before = ("Inputs: u", "Dynamics: 3 pairs", "Noise: Gaussian")
-    after = ("Inputs: u", "Extra: c", "Dynamics: 4 pairs", "Noise: Student-t")
+    before = (Part("inputs", "1 input"), Part("dynamics", "linear", "3 pairs"), Part("noise", "n"))
+    after = (before[0], Part("recorded", "recorded", "c"), Part("dynamics", "linear", "4 pairs"),
+             Part("noise", "Student-t", "4"))  # fmt: skip
     assert marks(before, after) == ["", "new", "changed", "changed"]
-    assert marks(("a: 1", "a: 1"), ("a: 1", "a: 1", "a: 1")) == ["", "", "new"]
+    same = Part("a", "a", "1")
+    assert marks((same, same), (same, same, same)) == ["", "", "new"]
     assert marks(before, before) == [""] * 3
 
 
 def test_diagram_of_many_parts():
-    lines = [f"Part {k}: {'a_long_name' * 5}" for k in range(12)]
-    drawn = Parsed(diagram(lines, [""] * 12, "Model"))
+    parts = [Part("part", f"Part {k}", "a_long_name" * 5) for k in range(12)]
+    drawn = Parsed(diagram(parts, [""] * 12, "Model"))
     boxes = drawn.all("rect")
     assert len(boxes) == 12
     assert len(drawn.all("polyline")) == 11
@@ -285,10 +292,26 @@ def test_diagram_of_many_parts():
 
 
 def test_parts_that_join_have_a_plus_sign():
-    lines = ["1 input", "recorded: channel c", "linear dynamics, 3 pairs of poles, process noise",
-             "static function, 12 values", "plus trend: begin 0", "Gaussian noise"]  # fmt: skip
-    drawn = Parsed(diagram(lines, [""] * 6, "Model"))
+    channels = (Recorded("c"), Delayed("u", 0.5), Trend(0.0, 1.0))
+    model = dgp.Wiener(1)
+    for channel in channels:
+        model = with_channel(model, channel)
+    parts = describe(model)
+    assert [part.joins for part in parts] == [False, True, False, False, False, True, True]
+    drawn = Parsed(diagram(parts, [""] * 7, "Model"))
     assert len(drawn.all("path")) == 3
-    # The last part begins a second row, to which a line leads as well.
-    assert len(drawn.all("polyline")) == 3
-    assert "linear dynamics 3 pairs of poles, process noise" in drawn.text
+    # The last parts begin a second row, to which a line leads as well.
+    assert len(drawn.all("polyline")) == 4
+    assert "linear dynamics 5 pairs of poles, process noise" in drawn.text
+
+
+def test_lines_of_a_model():
+    model = with_channel(dgp.LinearDynamicGP(2, pairs=1, process_noise=False), Step(2.5))
+    model = with_likelihood(with_output_function(model, (None, 0.61)), dgp.StudentT(4.0))
+    assert [str(part) for part in describe(model)] == [
+        "2 inputs",
+        "linear dynamics, 1 pair of poles, no process noise",
+        "static function, 32 inducing values, stops at 0.61",
+        "plus step: at 2.5",
+        "Student-t noise, 4 degrees of freedom",
+    ]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import textwrap
 from collections.abc import Sequence
 
+from pyro_dynogp.models.description import Part
 from pyro_dynogp.report.html.html import text
 
 # Sizes in units of the drawing; a row holds as many boxes as fit into its width.
@@ -16,8 +16,6 @@ CHARACTERS = 20
 _KEPT = 'fill="#f4f7fa" stroke="#4a4a4a" stroke-width="1.2"'
 _ADDED = 'fill="#fff1d0" stroke="#9a5b00" stroke-width="3"'
 _BOXES = {"new": _ADDED, "changed": _ADDED, "": _KEPT, "removed": f'{_KEPT} stroke-dasharray="5 4"'}
-# Lines that begin so join what comes before them; all others act on it.
-_JOINS = ("plus ", "extra input", "recorded", "transformed", "product", "trend of gain")
 _TEXT = 'text-anchor="middle" font-family="Segoe UI, Roboto, Helvetica, Arial, sans-serif"'
 _WORDS = {
     "heading": 'font-size="13" font-weight="600" fill="#1a1a1a"',
@@ -26,37 +24,34 @@ _WORDS = {
 }
 
 
-def marks(before: Sequence[str], after: Sequence[str]) -> list[str]:
-    """What became of each line of `after`: "" (as before), "changed" or "new"."""
-    gone, found = list(before), [""] * len(after)
-    for line in after:
-        if line in gone:
-            gone.remove(line)
-    kept = list(before)
-    for k, line in enumerate(after):
-        if line in kept:
-            kept.remove(line)
-            continue
-        heading = line.partition(":")[0]
-        alike = [one for one in gone if ":" in one and one.partition(":")[0] == heading]
-        alike = alike or difflib.get_close_matches(line, gone, 1, 0.6)
+def marks(before: Sequence[Part], after: Sequence[Part]) -> list[str]:
+    """What became of each part of `after`: "" (as before), "changed" or "new"."""
+    left, found = list(before), [""] * len(after)
+    others = []
+    for k, part in enumerate(after):
+        if part in left:
+            left.remove(part)
+        else:
+            others.append(k)
+    for k in others:
+        alike = [part for part in left if part.kind == after[k].kind]
         found[k] = "changed" if alike else "new"
         if alike:
-            gone.remove(alike[0])
+            left.remove(alike[0])
     return found
 
 
-def diagram(lines: Sequence[str], marked: Sequence[str], name: str) -> str:
-    """Boxes in the order of the lines, in rows that are read from left to right.
+def diagram(model: Sequence[Part], marked: Sequence[str], name: str) -> str:
+    """Boxes in the order of the parts, in rows that are read from left to right.
 
     Args:
-        lines: of the model; what is before the first colon, or else comma, is the heading of its
-            box. Parts that join the others, as noise does, have a plus sign at their arrow.
+        model: its parts. Those that join the others, as noise does, have a plus sign in place of
+            an arrow.
         marked: a mark of each box, "" for none. name: of the drawing, for who cannot see it.
     """
-    boxes = [_words(line) for line in lines]
+    boxes = [_words(part) for part in model]
     said = " → ".join(
-        f"{line} ({mark})" if mark else line for line, mark in zip(lines, marked, strict=True)
+        f"{part} ({mark})" if mark else str(part) for part, mark in zip(model, marked, strict=True)
     )
     rows = [range(k, min(k + PER_ROW, len(boxes))) for k in range(0, len(boxes), PER_ROW)]
     parts: list[str] = []
@@ -67,7 +62,7 @@ def diagram(lines: Sequence[str], marked: Sequence[str], name: str) -> str:
         for place, k in enumerate(row):
             left = 2.0 + place * (BOX + GAP)
             middle = top + high / 2
-            if place and _joins(lines[k]):
+            if place and model[k].joins:
                 parts.append(_plus(left - GAP / 2, middle))
             elif place:
                 parts.append(_arrow([(left - GAP, middle), (left, middle)]))
@@ -77,7 +72,7 @@ def diagram(lines: Sequence[str], marked: Sequence[str], name: str) -> str:
                 parts.append(
                     _arrow([(x, y), (x, bend), (left + BOX / 2, bend), (left + BOX / 2, top)])
                 )
-                if _joins(lines[k]):
+                if model[k].joins:
                     parts.append(_plus(left + BOX / 2 + 18, top - 10))
             parts.append(_box(left, top, high, boxes[k], marked[k]))
         before = (2.0 + (len(row) - 1) * (BOX + GAP) + BOX / 2, top + high)
@@ -90,17 +85,10 @@ def diagram(lines: Sequence[str], marked: Sequence[str], name: str) -> str:
     )
 
 
-def _words(line: str) -> tuple[list[str], list[str]]:
+def _words(part: Part) -> tuple[list[str], list[str]]:
     """Heading and details of a box, in lines that fit into it."""
-    heading, _, details = line.partition(":" if ":" in line else ", ")
-    return textwrap.wrap(heading.strip(), CHARACTERS - 2), textwrap.wrap(
-        details.strip(), CHARACTERS
-    )
-
-
-def _joins(line: str) -> bool:
-    heading = "".join(_words(line)[0]).lower()
-    return line.lower().startswith(_JOINS) or heading.endswith("noise")
+    heading = textwrap.wrap(part.heading.strip(), CHARACTERS - 2)
+    return heading, textwrap.wrap(part.details.strip(), CHARACTERS)
 
 
 def _plus(x: float, y: float) -> str:

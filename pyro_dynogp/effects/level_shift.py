@@ -1,14 +1,19 @@
-"""Effects of time that are slow or sudden: drift, level shift. Periodic ones: `periodic`."""
+"""A level that jumps at one instant."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from pyro_dynogp.effects.periodic import periodic_disturbance
+from pyro_dynogp.data.channels import Step
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.effects.base import Effect, number_of
+from pyro_dynogp.models.variants import Model, with_channel
 from pyro_dynogp.statistics.bootstrap import (
     Prepare,
     Score,
-    columns_score,
+    Scored,
     explained_by,
     log_ratio,
     projector,
@@ -17,85 +22,13 @@ from pyro_dynogp.statistics.bootstrap import (
     spanning,
 )
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
-from pyro_dynogp.statistics.shares_of_inputs import paths
-from pyro_dynogp.statistics.time_pictures import instant, over_time, size_in_words
+from pyro_dynogp.statistics.time_pictures import instant, over_time
 from pyro_dynogp.statistics.whitening import Whitener
 
-__all__ = ["drift", "level_shift", "periodic_disturbance"]
-
-# Cosines of a drift: the slowest runs once from one end to the other, the fastest four times.
-SLOW = ((1,), (1, 2), (1, 2, 3, 4))
-# Inputs beyond which a drift of gain is looked for in the mean as a whole only.
-INPUTS = 4
 # Share of the record at each end where no level shift is looked for: too short to tell a level.
 END = 0.03
 # Levels of a staircase that stands for any step while the first filter is fitted.
 LEVELS = 8
-
-
-def drift(residuals: Residuals, *, seed: int = 0) -> Evidence:
-    """A slow change over the whole record, of the level or of a gain.
-
-    The level changes by cosines of k half periods over the record, k = 1 to 4; a gain by the same
-    cosines times the mean's deviation from its average, or times the share of one input.
-
-    Args:
-        residuals: of one output (n,). seed: of the replicates.
-
-    Returns:
-        where: form "additive" or "gain", channel (input or output whose gain drifts, "" for the
-        level), time_scale (half a period of what dominates) [time unit].
-
-    Raises:
-        ValueError: where fewer than 30 samples are measured.
-
-    Source: slow cosines as in Müller & Watson, Econometrica 76(5):979 (2008); the null by `sieve`.
-    """
-    r = residuals
-    t = (r.time - r.time[0]) / (r.time[-1] - r.time[0])
-    slow = np.cos(np.pi * t[:, None] * np.arange(1, SLOW[-1][-1] + 1))
-    names, scaled = [""], [np.ones(len(r))]
-    mean = r.mean - r.mean.mean()
-    nuisance = mean[:, None]
-    if mean.std() > 0:
-        names, scaled = [*names, r.output_name], [*scaled, mean]
-    if 2 <= len(r.input_names) <= INPUTS:
-        shares = paths(r).shares
-        nuisance = np.column_stack([nuisance, shares])
-        names = [*names, *r.input_names]
-        scaled = [*scaled, *(shares - shares.mean(0)).T]
-    K = slow.shape[1]
-    columns = np.concatenate([slow * s[:, None] for s in scaled], axis=1)
-    variants = [np.array(k) - 1 + K * j for j in range(len(scaled)) for k in SLOW]
-    found = sieve(
-        r.residual,
-        columns_score(columns, variants, spanning(nuisance), ~np.isfinite(r.residual)),
-        np.array([len(v) for v in variants]),
-        deviations=r.deviations,
-        first=np.column_stack([columns, nuisance]),
-        replicates=replicates(len(r), columns.shape[1]),
-        seed=seed,
-    )
-    j, order = divmod(found.best, len(SLOW))
-    # What the fitted effect is as a function of time alone, and the cosine that dominates there.
-    basis = slow[:, [k - 1 for k in SLOW[order]]] * scaled[j][:, None]
-    joined = np.column_stack([basis, np.ones(len(r))])
-    weights = np.linalg.lstsq(joined, found.fitted, rcond=None)[0][:-1]
-    k = float(np.square(weights) @ np.array(SLOW[order]) / max(np.square(weights).sum(), 1e-300))
-    scale = float(r.time[-1] - r.time[0]) / max(k, 1.0)
-    form = "gain" if names[j] else "additive"
-    what = f"The gain of {names[j]!r}" if names[j] else f"The level of {r.output_name!r}"
-    return Evidence(
-        effect="drift",
-        statistic=found.statistic,
-        p_value=found.p_value,
-        gain=found.gain,
-        size=found.size,
-        where={"form": form, "channel": names[j], "time_scale": scale},
-        sentence=f"{what} drifts over about {scale:.3g} {r.time_unit}: "
-        f"{size_in_words(r, found.size)}.",
-        curve=over_time(r, found.fitted),
-    )
 
 
 def level_shift(residuals: Residuals, *, seed: int = 0) -> Evidence:
@@ -174,7 +107,7 @@ def _steps(places: np.ndarray, nuisance: np.ndarray, missing: np.ndarray) -> Pre
         left = norm - np.square(beside).sum(1)
         usable = left > 1e-6 * norm
 
-        def score(x: np.ndarray):
+        def score(x: np.ndarray) -> Scored:
             e0 = whiten(x)[there]
             q = Q.T @ e0
             e = e0 - Q @ q
@@ -191,3 +124,16 @@ def _steps(places: np.ndarray, nuisance: np.ndarray, missing: np.ndarray) -> Pre
         return score
 
     return prepare
+
+
+class LevelShift(Effect):
+    """A level that jumps at one instant."""
+
+    name = "level shift"
+    family = "time"
+    localised = True
+    test = staticmethod(level_shift)
+
+    def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
+        """A step at the instant."""
+        return [with_channel(model, Step(number_of(evidence, "time")))]

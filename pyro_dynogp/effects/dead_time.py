@@ -1,60 +1,91 @@
-"""Effects between inputs and output that are linear: a path, a delay, more dynamics."""
+"""An input that arrives later than the model has it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 
-from pyro_dynogp.data.channels import Channel, Delayed, Product, Recorded, Transformed
+from pyro_dynogp.data.channels import Delayed
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.signals import shifted
 from pyro_dynogp.effects.base import (
     AROUND,
     FINER,
     Effect,
-    centre_of,
     changed,
     listed,
     number_of,
     set_last,
     unit_of,
 )
-from pyro_dynogp.effects.delay_regression import likely_delays
-from pyro_dynogp.effects.path_effects import dead_time, extra_input, unmodelled_dynamics
-from pyro_dynogp.models.variants import Model, with_channel, with_pairs, without_channel
-from pyro_dynogp.statistics.evidence import Evidence, Residuals
+from pyro_dynogp.effects.delay_regression import likely_delays, resolved
+from pyro_dynogp.models.variants import Model, with_channel, without_channel
+from pyro_dynogp.statistics.detecting import (
+    NOTICED,
+    labelled,
+    lasting,
+    located,
+    profiled,
+    regained,
+    unit,
+)
+from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
+from pyro_dynogp.statistics.regression import with_past
+from pyro_dynogp.statistics.shares_of_inputs import paths
 
 # Delays that are tried whatever the data say.
 COARSE = 5
 
 
-class ExtraInput(Effect):
-    """A recorded channel that acts: through dynamics, alone, squared, or times an input."""
+def dead_time(residuals: Residuals, *, seed: int = 0) -> Evidence:
+    """Test whether the output follows an input later (or earlier) than the model says.
 
-    name = "extra input"
-    family = "paths"
-    freedom = 2
-    test = staticmethod(extra_input)
+    The column is mean_j(t - d) - mean_j(t), where mean_j is what input j contributes to the mean:
+    all of it with one input, the share by `paths` with several. The delay is that at which the
+    column fits with a weight of one. `where`: channel, delay (additional, > 0 for later)
+    [time unit].
 
-    def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
-        """The channel, or what is made from it, as an input; with its delay where there is one."""
-        channel, form = str(evidence.where["channel"]), str(evidence.where["form"])
-        delay = number_of(evidence, "delay")
-        if form == "linear":
-            plain = with_channel(model, Recorded(channel))
-            if delay < 2.0 * record.sampling_time:
-                return [plain]
-            (later,) = _resolved([delay], record)
-            return [plain, with_channel(plain, Delayed(channel, later))]
-        made: Channel
-        if form in ("square", "absolute"):
-            made = Transformed(channel, form, centre_of(record, channel))
-        else:
-            other = form.removeprefix("product with ")
-            made = Product(channel, other, centre_of(record, channel), centre_of(record, other))
-        alone = with_channel(model, made)
-        return [alone, with_channel(alone, Recorded(channel))]
+    Raises:
+        ValueError: where fewer than 30 samples are held out and measured.
+    """
+    r = residuals
+    names, shares = r.input_names, paths(r).shares
+    longest = 0.1 * (r.time[-1] - r.time[0])
+
+    def late(j: int, delay: float) -> np.ndarray:
+        return shifted(shares[:, j], r.time, delay) - shares[:, j]
+
+    sizes = np.geomspace(0.25 * r.step, longest, 12)
+    coarse = np.concatenate([-sizes[::-1], sizes])
+    tried = [(j, float(d)) for j in range(len(names)) for d in coarse]
+    variants = [with_past(late(j, d)) for j, d in tried]
+    mean = r.mean[:, None]
+    found = lasting(regained(r), variants, mean, seed)
+    j, nearest = tried[found.best]
+    # Without a column for no delay, small ones of either sign look the same but for their weight.
+    grid = np.unique(np.concatenate([coarse, np.linspace(-1.0, 1.0, 9) * r.step]))
+    delay = nearest
+    if found.p_value < NOTICED:
+        delay = located(r, lambda d: late(j, d), nearest, grid, mean, weight=1.0)
+    profile = profiled(r, [late(j, d) for d in grid], mean, late(j, delay), weight=1.0)
+    column = late(j, delay)
+    word = "later" if delay > 0 else "earlier"
+    label = labelled("additional delay", r.time_unit)
+    return Evidence(
+        effect="dead time",
+        statistic=found.statistic,
+        p_value=found.p_value,
+        gain=found.gain,
+        size=float(column.std()),
+        where={"channel": names[j], "delay": delay},
+        sentence=f"'{r.output_name}' follows channel '{names[j]}' {abs(delay):.3g}"
+        f"{unit(r.time_unit)} {word} than the model says, "
+        f"about {column.std():.2g}{unit(r.output_unit)} (rms).",
+        curve=Curve(grid, profile, np.full(len(grid), np.nan), label, "gain [nats]"),
+    )
 
 
 class DeadTime(Effect):
@@ -62,6 +93,11 @@ class DeadTime(Effect):
 
     name = "dead time"
     family = "paths"
+    acts_on = "inputs"
+    experiments: ClassVar = {
+        "unmodelled dynamics": "a step of the input, sampled several times faster: after a dead "
+        "time nothing moves at first, more dynamics begin at once",
+    }
 
     def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
         """One for each input."""
@@ -88,9 +124,7 @@ class DeadTime(Effect):
             u, y = prepared.inputs[:, : len(names)], prepared.outputs[:, 0]
             found = {step * d for d in likely_delays(y, u, place, longest)}
             delays = grid | found | (around if channel in chosen else set())
-            tried = (
-                _later(model, chosen, delay, 0.2 * step) for delay in _resolved(delays, record)
-            )
+            tried = (_later(model, chosen, delay, 0.2 * step) for delay in resolved(delays, record))
             variants += [one for one in tried if one is not None]
         return variants
 
@@ -109,23 +143,8 @@ class DeadTime(Effect):
         if record.is_regular:
             near |= {delay + k * step for k in (-2, -1, 1, 2)}
         return [
-            changed(model, found, delay=later)
-            for later in _resolved(near, record)
-            if later != delay
+            changed(model, found, delay=later) for later in resolved(near, record) if later != delay
         ]
-
-
-def _resolved(delays: Iterable[float], record: Record) -> list[float]:
-    """Delays that a record can tell apart: on an even clock whole samples, one at least.
-
-    A held input that arrives within a sample is, at the samples, one that arrives with the next and
-    acts with another numerator: x[k+1] = phi x[k] + g1 u[k] + g2 u[k+1] for every fraction of it
-    (Franklin, Powell & Workman, Digital Control of Dynamic Systems, 3rd ed., section 4.3).
-    """
-    if not record.is_regular:
-        return sorted(delays)
-    step = record.sampling_time
-    return [step * count for count in sorted({max(round(one / step), 1) for one in delays})]
 
 
 def _later(model: Model, names: Sequence[str], more: float, least: float) -> Model | None:
@@ -140,16 +159,3 @@ def _later(model: Model, names: Sequence[str], more: float, least: float) -> Mod
             return None
         model = with_channel(model, Delayed(source, known + more))
     return model
-
-
-class UnmodelledDynamics(Effect):
-    """More poles than the model has."""
-
-    name = "unmodelled dynamics"
-    family = "paths"
-    freedom = 5
-    test = staticmethod(unmodelled_dynamics)
-
-    def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
-        """One pair of poles more, or two."""
-        return [with_pairs(model, 1), with_pairs(model, 2)]

@@ -1,0 +1,153 @@
+"""Sines in a residual: their gains by Fourier transforms, refinement, harmonics."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.fft import fft, rfft
+from scipy.optimize import minimize_scalar
+from scipy.stats import chi2
+
+from pyro_dynogp.statistics.bootstrap import (
+    Prepare,
+    Score,
+    Scored,
+    explained_by,
+    log_ratio,
+    projector,
+    spanning,
+)
+from pyro_dynogp.statistics.evidence import Residuals
+from pyro_dynogp.statistics.whitening import Whitener
+from pyro_dynogp.support.errors import invalid
+
+HARMONICS = 4
+
+
+def slots(r: Residuals) -> np.ndarray:
+    """Number of each sample (n,) on the clock of equal steps."""
+    exact = (r.time - r.time[0]) / r.step
+    at = np.round(exact).astype(int)
+    if np.abs(exact - at).max() > 0.1 or (np.diff(at) < 1).any():
+        raise invalid(
+            "residuals",
+            expected="equal steps, or multiples of one step",
+            got="irregular ones",
+            advice="Resample the record; missing samples may be NaN.",
+        )
+    return at
+
+
+def lines(bins: np.ndarray, length: int, nuisance: np.ndarray, missing: np.ndarray) -> Prepare:
+    """Score of sines at frequencies bins / length [1 / step]: all by one Fourier transform.
+
+    A filter makes of a sine a sine of the same frequency, so both span the same, and the
+    residual's own past stands beside it as more columns of nuisance.
+    """
+
+    def prepare(whiten: Whitener) -> Score:
+        p, n = whiten.order, len(missing)
+        there = ~missing
+        for k in range(1, p + 1):
+            there[k:] &= ~missing[: n - k]
+            there[:k] = False
+        rows = np.flatnonzero(there)
+        beside = spanning(nuisance[rows])
+        mask = there.astype(float)
+        double = fft(mask, length)[(2 * bins) % length]
+
+        def parts(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            full = np.zeros((values.shape[1], n))
+            full[:, rows] = values.T
+            F = rfft(full, length, axis=1)[:, bins]
+            return F.real, -F.imag
+
+        def score(x: np.ndarray) -> Scored:
+            past = [x[rows - k] for k in range(1, p + 1)]
+            Q = np.linalg.qr(np.column_stack([beside, *past]))[0]
+            e = x[rows] - Q @ (Q.T @ x[rows])
+            C, S = parts(np.column_stack([e, Q]))
+            c, s, C, S = C[0], S[0], C[1:], S[1:]
+            cc = 0.5 * (len(rows) + double.real) - np.square(C).sum(0)
+            ss = 0.5 * (len(rows) - double.real) - np.square(S).sum(0)
+            cs = -0.5 * double.imag - (C * S).sum(0)
+            determinant = cc * ss - cs**2
+            usable = determinant > 1e-6 * len(rows) ** 2
+            explained = (ss * c**2 - 2.0 * cs * c * s + cc * s**2) / np.where(
+                usable, determinant, 1.0
+            )
+            samples = len(e) - Q.shape[1]
+            gains = samples * log_ratio(np.where(usable, explained, 0.0), float(e @ e))
+
+            def fit(j: int) -> tuple[np.ndarray, np.ndarray]:
+                line = _wave(n, bins[j] / length)
+                design = np.column_stack([*past, line[rows], nuisance[rows]])
+                own_filter = Whitener(np.linalg.lstsq(design, x[rows], rcond=1e-9)[0][:p])
+                return explained_by(own_filter, there[p:], line, nuisance, x)
+
+            return gains, fit
+
+        return score
+
+    return prepare
+
+
+def _sine(n: int, frequency: float) -> np.ndarray:
+    """Cosine and sine (n, 2) of a frequency [1 / step]."""
+    angle = 2.0 * np.pi * frequency * np.arange(n)
+    return np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def _wave(n: int, frequency: float) -> np.ndarray:
+    """Sines of a frequency and its harmonics, and how they change with it (n, K).
+
+    Of a strong line what a grid of frequencies misses, and what its harmonics are, would still look
+    like colour, which a filter of high order explains.
+    """
+    shift = np.linspace(-1.0, 1.0, n)[:, None]
+    # At half the sampling rate a sine is nothing, and next to it is nearly what a cosine becomes.
+    inside = [h * frequency for h in range(1, HARMONICS + 1) if h * frequency < 0.5 - 2.0 / n]
+    waves = [_sine(n, f) for f in inside] or [_sine(n, frequency)]
+    return np.column_stack([*waves, *(shift * wave for wave in waves if inside)])
+
+
+def refined(
+    whiten: Whitener, x: np.ndarray, nuisance: np.ndarray, frequency: float, width: float
+) -> float:
+    """Frequency of largest gain within `width` of one on the grid [1 / step]."""
+    there, Q, _ = projector(whiten, nuisance, ~np.isfinite(x))
+    e = whiten(x)[there]
+    e = e - Q @ (Q.T @ e)
+
+    def left(f: float) -> float:
+        w = whiten(_sine(len(x), f))[there]
+        w = w - Q @ (Q.T @ w)
+        return -float(e @ w @ np.linalg.lstsq(w, e, rcond=1e-9)[0])
+
+    bounds = (max(frequency - width, 0.1 / len(x)), min(frequency + width, 0.5))
+    return float(minimize_scalar(left, bounds=bounds, method="bounded").x)
+
+
+def harmonics(
+    whiten: Whitener, x: np.ndarray, nuisance: np.ndarray, frequency: float
+) -> tuple[np.ndarray, list[int]]:
+    """The sine with those harmonics that explain more at 1 % (n,), and which they are."""
+    there = np.isfinite(whiten(x))
+    columns, also, n = _sine(len(x), frequency), list[int](), len(x)
+
+    def total(columns: np.ndarray) -> float:
+        joined = whiten(np.column_stack([columns, nuisance]))[there]
+        e = whiten(x)[there]
+        return float(np.square(e - joined @ np.linalg.lstsq(joined, e, rcond=1e-9)[0]).sum())
+
+    known, last = int(there.sum()), total(columns)
+    for h in range(2, HARMONICS + 1):
+        if h * frequency >= 0.5:
+            break
+        more = np.column_stack([columns, _sine(n, h * frequency)])
+        left = total(more)
+        if chi2.sf(known * np.log(max(last, 1e-300) / max(left, 1e-300)), 2) < 0.01 / (
+            HARMONICS - 1
+        ):
+            columns, last = more, left
+            also.append(h)
+    return explained_by(whiten, there, columns, nuisance, x)[0], also

@@ -1,0 +1,91 @@
+"""Disturbances that pass through dynamics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.effects.base import Effect
+from pyro_dynogp.models.variants import Model, has_process_noise, with_pairs, with_process_noise
+from pyro_dynogp.statistics.autoregression import fitted_filter
+from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
+from pyro_dynogp.statistics.serial import held_out_innovations, one_step_sd, portmanteau
+
+
+def process_noise(residuals: Residuals, *, seed: int = 0) -> Evidence:
+    """Disturbances that pass through dynamics: autocorrelated held-out one-step errors.
+
+    Their null keeps their sizes in place, so that heteroscedastic noise does not look coloured.
+
+    Args:
+        residuals: of one output (n,). seed: of the random signs.
+
+    Returns:
+        where: time_constant of an autocorrelation c exp(-lag / time_constant) [time unit], zero
+        where neighbours differ in sign. size: what the past tells of the one-step error [output].
+
+    Raises:
+        ValueError: where fewer than 30 held-out samples are measured.
+
+    Source: `portmanteau`.
+    """
+    r = residuals
+    v = held_out_innovations(r)
+    statistic, p_value, window, rho = portmanteau(v, seed, signs=True)
+    gain = 0.5 * float(np.isfinite(v).sum()) * float(np.square(rho[:window]).sum())
+    decay, amplitude = _decay(rho)
+    constant = -r.step / np.log(decay) if decay > 0 else 0.0
+    whiten = fitted_filter(v)
+    left = float(np.nanvar(whiten(v)) / max(np.nanvar(v), 1e-300))
+    known = f"; their autocorrelation decays with a time constant of {constant:.3g} {r.time_unit}"
+    lags = np.arange(1, len(rho) + 1)
+    return Evidence(
+        effect="process noise",
+        statistic=statistic,
+        p_value=p_value,
+        gain=gain,
+        size=one_step_sd(r) * float(np.sqrt(max(1.0 - left, 0.0))),
+        where={"time_constant": float(constant)},
+        sentence=f"One-step errors of {r.output_name!r} depend on earlier ones ({rho[0]:.2f} with "
+        f"the one before){known if decay > 0 else ''}.",
+        curve=Curve(
+            x=lags * r.step,
+            y=rho,
+            fitted=amplitude * decay**lags,
+            x_label=f"lag [{r.time_unit}]",
+            y_label=f"autocorrelation of one-step errors of {r.output_name}",
+        ),
+    )
+
+
+def _decay(rho: np.ndarray) -> tuple[float, float]:
+    """Decay per step and amplitude of amplitude * decay^lag, least squares; zeros: none."""
+    grid = np.linspace(0.01, 0.995, 198)
+    shapes = grid[:, None] ** np.arange(1, len(rho) + 1)
+    norm = np.square(shapes).sum(1)
+    amplitude = shapes @ rho / norm
+    gain = np.where(amplitude > 0, amplitude**2 * norm, 0.0)
+    best = int(np.argmax(gain))
+    return (float(grid[best]), float(amplitude[best])) if gain[best] > 0 else (0.0, 0.0)
+
+
+class ProcessNoise(Effect):
+    """Disturbances that pass through dynamics."""
+
+    name = "process noise"
+    score = "one step"
+    family = "paths"
+    acts_on = "noise"
+    freedom = 6
+    once = True
+    absorbs_structure = True
+    test = staticmethod(process_noise)
+
+    def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
+        """Process noise in every dynamic layer; where it is there, more poles are for dynamics."""
+        if has_process_noise(model):
+            return []
+        noisy = with_process_noise(model)
+        return [noisy, with_pairs(noisy, 1)]

@@ -1,0 +1,80 @@
+"""Models in words, part by part."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+from pyro_dynogp.data.channels import Channel
+from pyro_dynogp.layers.noise import Likelihood
+from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.wiring import Dynamic, Static
+
+
+@dataclass(frozen=True)
+class Part:
+    """One part of a model in words; as a string it is one line.
+
+    Attributes:
+        kind: of two models, parts of one kind are the same part with other numbers.
+        heading: what it is. details: its numbers, "" for none.
+        joins: whether it is added to what comes before it, rather than acting on that.
+        separator: between heading and details in a line.
+    """
+
+    kind: str
+    heading: str
+    details: str = ""
+    joins: bool = False
+    separator: str = ", "
+
+    def __str__(self) -> str:
+        return f"{self.heading}{self.separator}{self.details}" if self.details else self.heading
+
+
+def describe(model: Model) -> tuple[Part, ...]:
+    """Each part of a model, inputs first, measured output last."""
+    channels = [(in_words(one), one) for one in model.channels]
+    driving = [part for part, one in channels if not one.direct]
+    direct = [replace(part, heading=f"plus {part.heading}") for part, one in channels if one.direct]
+    count = model.inputs - model.direct
+    inputs = Part("inputs", f"{count} input{'s' if count != 1 else ''}")
+    layers = [_layer(layer) for layer in model.layers]
+    plain = model.direct - sum(len(one.names) for one in model.channels if one.direct)
+    if plain:
+        direct.append(Part("direct inputs", f"plus {plain} direct inputs", joins=True))
+    return (inputs, *driving, *layers, *direct, _noise(model.likelihood))
+
+
+def _layer(layer: Dynamic | Static) -> Part:
+    if isinstance(layer, Dynamic):
+        noise = "process noise" if layer.process_noise else "no process noise"
+        pairs = f"{layer.pairs} pair{'s' if layer.pairs != 1 else ''} of poles"
+        return Part("dynamics", "linear dynamics", f"{pairs}, {noise}")
+    limits = [f"{at:.4g}" for at in layer.limits or () if at is not None]
+    stops = f", stops at {' and '.join(limits)}" if limits else ""
+    return Part("function", "static function", f"{layer.inducing} inducing values{stops}")
+
+
+def _noise(likelihood: Likelihood) -> Part:
+    if likelihood.varying:
+        return Part("noise", f"Gaussian noise that varies with the {likelihood.of}", joins=True)
+    if likelihood.degrees_of_freedom is not None:
+        details = f"{likelihood.degrees_of_freedom:.3g} degrees of freedom"
+        return Part("noise", "Student-t noise", details, joins=True)
+    return Part("noise", "Gaussian noise", joins=True)
+
+
+def in_words(channel: Channel) -> Part:
+    """What a channel is, with its numbers."""
+    kind = "".join(f" {c.lower()}" if c.isupper() else c for c in type(channel).__name__).strip()
+    values = []
+    for field in fields(channel):
+        value = getattr(channel, field.name)
+        if isinstance(value, tuple):
+            value = ", ".join(f"{v:.4g}" for v in value)
+        values.append(
+            f"{field.name.replace('_', ' ')} {value:.4g}"
+            if isinstance(value, float)
+            else f"{field.name.replace('_', ' ')} {value}"
+        )
+    return Part(kind, kind, "; ".join(values), joins=not channel.replaces, separator=": ")
