@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from pyro_dynogp.distributions.process import LTIProcess, ObservedLTIProcess
     from pyro_dynogp.distributions.reparam import InnovationReparam
     from pyro_dynogp.examples import datasets
+    from pyro_dynogp.fitting import Fit, fit, load
     from pyro_dynogp.gp import LTIKernel, LTIMean, LTIParameters
     from pyro_dynogp.guides.families import (
         Family,
@@ -35,10 +36,11 @@ if TYPE_CHECKING:
         SameAsPrior,
     )
     from pyro_dynogp.guides.layer_guide import LayerGuide
-    from pyro_dynogp.inference.fit import fit
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.inference.methods.mode import Mode
+    from pyro_dynogp.inference.methods.nuts import Nuts
+    from pyro_dynogp.inference.methods.optima import Normal
     from pyro_dynogp.inference.methods.svi import TrainingDivergedError
-    from pyro_dynogp.inference.storage import load
+    from pyro_dynogp.inference.methods.trajectories import Trajectories
     from pyro_dynogp.layers.functions import StaticFunction
     from pyro_dynogp.layers.noise import Gaussian, Heteroscedastic, Likelihood, StudentT
     from pyro_dynogp.layers.static import sample_static, static_gp
@@ -72,7 +74,7 @@ _HOME = {
     "ConditionedLTIProcess": "pyro_dynogp.distributions.conditioned",
     "Dynamic": "pyro_dynogp.models.wiring",
     "Family": "pyro_dynogp.guides.families",
-    "Fit": "pyro_dynogp.inference.fitted",
+    "Fit": "pyro_dynogp.fitting",
     "FullRank": "pyro_dynogp.guides.families",
     "GaussMarkov": "pyro_dynogp.guides.families",
     "Gaussian": "pyro_dynogp.layers.noise",
@@ -93,6 +95,10 @@ _HOME = {
     "LogDecayRate": "pyro_dynogp.distributions.decay",
     "MeanField": "pyro_dynogp.guides.families",
     "ModalState": "pyro_dynogp.lti.state",
+    "Mode": "pyro_dynogp.inference.methods.mode",
+    "Normal": "pyro_dynogp.inference.methods.optima",
+    "Nuts": "pyro_dynogp.inference.methods.nuts",
+    "Trajectories": "pyro_dynogp.inference.methods.trajectories",
     "Modes": "pyro_dynogp.lti.modes",
     "OutputProcess": "pyro_dynogp.models.output_process",
     "ObservedLTIProcess": "pyro_dynogp.distributions.process",
@@ -116,10 +122,10 @@ _HOME = {
     "check": "pyro_dynogp.criticism.check",
     "close_loop": "pyro_dynogp.discrepancy.loop",
     "compare": "pyro_dynogp.criticism.comparison",
-    "fit": "pyro_dynogp.inference.fit",
+    "fit": "pyro_dynogp.fitting",
     "from_pyro": "pyro_dynogp.criticism.from_pyro",
     "inducing_times": "pyro_dynogp.distributions.inducing",
-    "load": "pyro_dynogp.inference.storage",
+    "load": "pyro_dynogp.fitting",
     "loo": "pyro_dynogp.criticism.loo",
     "predictive_checks": "pyro_dynogp.criticism.predictive_checks",
     "sample_modes": "pyro_dynogp.models.priors",
@@ -159,8 +165,11 @@ __all__ = [
     "LogDecayRate",
     "MeanField",
     "ModalState",
+    "Mode",
     "Model",
     "Modes",
+    "Normal",
+    "Nuts",
     "ObservedLTIProcess",
     "OutputProcess",
     "Point",
@@ -178,6 +187,7 @@ __all__ = [
     "System",
     "TimeScale",
     "TrainingDivergedError",
+    "Trajectories",
     "Wiener",
     "WienerHammerstein",
     "calibration",

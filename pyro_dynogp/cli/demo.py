@@ -16,7 +16,7 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.loop import close_loop
 from pyro_dynogp.discrepancy.report import Report
 from pyro_dynogp.examples import datasets
-from pyro_dynogp.inference.fit import Fit, fit
+from pyro_dynogp.fitting import Fit, fit
 from pyro_dynogp.models.architectures import LinearDynamicGP
 from pyro_dynogp.prediction.prediction import Prediction
 from pyro_dynogp.prediction.scores import scores

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
-from types import MappingProxyType
 from typing import Any, NoReturn
 
 import numpy as np
@@ -34,6 +33,7 @@ from pyro_dynogp.data.checks import (
 )
 from pyro_dynogp.data.writers import columns_of, summary, to_frame, to_xarray
 from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.frozen import FrozenMapping
 
 
 @dataclass(frozen=True)
@@ -148,8 +148,8 @@ class Record:
             "input_units": as_texts("input_units", input_units, len(u_names), unique=False),
             "output_units": as_texts("output_units", output_units, len(y_names), unique=False),
             "time_unit": time_unit,
-            "extra": MappingProxyType({k: frozen(v) for k, v in kept.items()}),
-            "extra_units": MappingProxyType({k: (extra_units or {}).get(k, "") for k in kept}),
+            "extra": FrozenMapping({k: frozen(v) for k, v in kept.items()}),
+            "extra_units": FrozenMapping({k: (extra_units or {}).get(k, "") for k in kept}),
             "name": str(name),
             "start": origin,
         }

@@ -14,7 +14,7 @@ from pyro_dynogp.prediction.records import gap_between, joined
 from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.fitting import Fit
 
 # Fewest samples of the blocks B and C, and fewest of them that were measured.
 FEWEST, MEASURED = 60, 30

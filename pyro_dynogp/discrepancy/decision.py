@@ -13,7 +13,7 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.report import Attempt
 from pyro_dynogp.discrepancy.search import Candidate, Found
 from pyro_dynogp.discrepancy.trials import NATS, Score, Trial, Tried, interleaved, run
-from pyro_dynogp.inference.fitted import Fit
+from pyro_dynogp.fitting import Fit
 from pyro_dynogp.models.variants import Model
 from pyro_dynogp.support.parallel import parallel_map
 

@@ -15,15 +15,15 @@ from pyro_dynogp.discrepancy.rounds import Rounds, Stopwatch
 from pyro_dynogp.discrepancy.state import Course
 from pyro_dynogp.discrepancy.trials import without
 from pyro_dynogp.effects import CATALOGUE, Effect
-from pyro_dynogp.inference.fit import fit as fit_model
-from pyro_dynogp.inference.fitted import Method
+from pyro_dynogp.fitting import fit as fit_model
+from pyro_dynogp.inference.posteriors import MethodName
 from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
 from pyro_dynogp.models.variants import used_channels
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.parallel import one_thread, parallel_map
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.fitting import Fit
 
 # Fresh starts of the last fits, of linear models and of cascades.
 LAST_LINEAR_STARTS, LAST_CASCADE_STARTS = 2, 1
@@ -132,7 +132,7 @@ def _final(fits: Sequence[Fit], record: Record, workers: int | None, progress: b
 
     def one(given: Fit) -> Fit:
         model = replace(given.model, scaling=None)
-        method: Method = "svi" if model.has_function or given.method != "map" else "map"
+        method: MethodName = "svi" if model.has_function or given.method != "map" else "map"
         restarts = LAST_LINEAR_STARTS if model.is_linear else LAST_CASCADE_STARTS
         return fit_model(
             model, record, method=method, start=given, restarts=restarts, seed=given.seed,

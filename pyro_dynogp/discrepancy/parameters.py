@@ -21,7 +21,7 @@ from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.wiring import Static
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.fitting import Fit
     from pyro_dynogp.statistics.evidence import Evidence
 
 Parameters = dict[str, tuple[float, float]]

@@ -14,7 +14,7 @@ from pyro_dynogp.statistics.evidence import Curve, Evidence
 
 if TYPE_CHECKING:
     from pyro_dynogp.data.record import Record
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.fitting import Fit
     from pyro_dynogp.prediction.prediction import Prediction
 
 Decision = Literal["accepted", "tie", "rejected", "not tried", "reported"]

@@ -24,7 +24,7 @@ from pyro_dynogp.statistics.evidence import Residuals
 from pyro_dynogp.support.parallel import parallel_map
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.fitting import Fit
 
 # Scores that rise by less do not speak against what was added: effects of the noise change them
 # by chance.

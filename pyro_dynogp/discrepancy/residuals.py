@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pyro_dynogp.criticism.posterior_draws import draws_of, with_draws
+from pyro_dynogp.criticism.posterior_draws import draws_of
 from pyro_dynogp.data.channels import count_direct
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.models.delays import longest_delay, unknown_beginning
@@ -16,7 +16,7 @@ from pyro_dynogp.statistics.evidence import Residuals
 from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.fitting import Fit
 
 # Time constants until a simulation has settled, and the share of a record that may be lost to it.
 SETTLED, LOST = 4.0, 0.1
@@ -55,7 +55,7 @@ def residuals_of(
     prepared = fit.model.check(record)[0]
     if fit.method == "map":
         drawn = draws_of(fit, count=DRAWS, seed=seed, anneal=False)
-        spread = with_draws(fit, drawn.values)
+        spread = fit.with_draws(drawn.values)
     else:
         spread = fit
     options = {} if fit.model.is_linear else {"process_noise": False}

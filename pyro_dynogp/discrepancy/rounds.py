@@ -27,7 +27,7 @@ from pyro_dynogp.statistics.evidence import Residuals
 from pyro_dynogp.statistics.omnibus import Beyond, beyond_catalogue, structure_left
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.fitting import Fit
 
 # Families of effects that go with inputs.
 OF_INPUTS = ("paths", "shapes")

@@ -20,7 +20,7 @@ from pyro_dynogp.report.words import OUTSIDE
 from pyro_dynogp.statistics.evidence import Residuals
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.fitting import Fit
 
 FED_BACK = "inputs are under feedback, for which the residual speaks more clearly"
 OTHERS = "others are more probable, or no block of the model stands for it"
