@@ -25,10 +25,13 @@ if TYPE_CHECKING:  # the same names, for editors and type checkers; a test compa
     )
     from pyro_dynogp.data.record import Record as Record
     from pyro_dynogp.data.scaling import Scaling as Scaling
-    from pyro_dynogp.discrepancy.loop import close_loop as close_loop
+    from pyro_dynogp.discrepancy.settings import LoopSettings as LoopSettings
     from pyro_dynogp.distributions.process import LTIProcess as LTIProcess
     from pyro_dynogp.distributions.reparam import InnovationReparam as InnovationReparam
     from pyro_dynogp.examples import datasets as datasets
+    from pyro_dynogp.fitting import Fit as Fit
+    from pyro_dynogp.fitting import fit as fit
+    from pyro_dynogp.fitting import load as load
     from pyro_dynogp.gp import LTIKernel as LTIKernel
     from pyro_dynogp.gp import LTIMean as LTIMean
     from pyro_dynogp.gp import LTIParameters as LTIParameters
@@ -36,10 +39,11 @@ if TYPE_CHECKING:  # the same names, for editors and type checkers; a test compa
     from pyro_dynogp.guides.families import GaussMarkov as GaussMarkov
     from pyro_dynogp.guides.families import InducingTimes as InducingTimes
     from pyro_dynogp.guides.layer_guide import LayerGuide as LayerGuide
-    from pyro_dynogp.inference.fit import fit as fit
-    from pyro_dynogp.inference.fitted import Fit as Fit
+    from pyro_dynogp.inference.methods.mode import Mode as Mode
+    from pyro_dynogp.inference.methods.nuts import Nuts as Nuts
+    from pyro_dynogp.inference.methods.optima import Normal as Normal
     from pyro_dynogp.inference.methods.svi import TrainingDivergedError as TrainingDivergedError
-    from pyro_dynogp.inference.storage import load as load
+    from pyro_dynogp.inference.methods.trajectories import Trajectories as Trajectories
     from pyro_dynogp.layers.noise import Gaussian as Gaussian
     from pyro_dynogp.layers.noise import Heteroscedastic as Heteroscedastic
     from pyro_dynogp.layers.noise import StudentT as StudentT
@@ -59,15 +63,20 @@ if TYPE_CHECKING:  # the same names, for editors and type checkers; a test compa
     from pyro_dynogp.models.wiring import Static as Static
     from pyro_dynogp.prediction.prediction import Prediction as Prediction
     from pyro_dynogp.prediction.scores import scores as scores
+    from pyro_dynogp.report.loop import close_loop as close_loop
 
 # Where each public name is defined. They are imported when they are first used (PEP 562), so that
 # the command line answers at once.
 HOMES = {
     # A record and a fit of it.
     "Record": "data.record",
-    "fit": "inference.fit",
-    "load": "inference.storage",
-    "Fit": "inference.fitted",
+    "fit": "fitting",
+    "load": "fitting",
+    "Fit": "fitting",
+    "Mode": "inference.methods.mode",
+    "Normal": "inference.methods.optima",
+    "Nuts": "inference.methods.nuts",
+    "Trajectories": "inference.methods.trajectories",
     "Prediction": "prediction.prediction",
     "Scaling": "data.scaling",
     "TrainingDivergedError": "inference.methods.svi",
@@ -95,7 +104,8 @@ HOMES = {
     "predictive_checks": "criticism.predictive_checks",
     "simulation_based_calibration": "criticism.simulation_based",
     "from_pyro": "criticism.from_pyro",
-    "close_loop": "discrepancy.loop",
+    "close_loop": "report.loop",
+    "LoopSettings": "discrepancy.settings",
     # Parts of a Pyro model of one's own.
     "LTIProcess": "distributions.process",
     "Modes": "lti.modes",

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 import pyro_dynogp as dgp
 from pyro_dynogp import plotting
+from pyro_dynogp.inference.posteriors import Sampled
 from pyro_dynogp.lti import views
 from pyro_dynogp.plotting.diagnostics import cross_correlation, prewhitened
 from pyro_dynogp.plotting.systems import _unwrapped
@@ -43,7 +44,7 @@ def with_draws(fit, count=25, seed=0):
         site: value * torch.as_tensor(1 + 0.03 * rng.normal(size=(count, *value.shape)))
         for site, value in fit.mode.items()
     }
-    return dataclasses.replace(fit, method="nuts", draws=draws)
+    return dataclasses.replace(fit, posterior=Sampled(draws), draws=draws)
 
 
 @pytest.fixture(scope="module")
@@ -415,7 +416,9 @@ def test_history(map_fit):
     np.testing.assert_array_equal(axes.lines[0].get_ydata(), map_fit.history)
     assert axes.get_ylabel() == "-log p(outputs, parameters) [nats]"
     noisy = dataclasses.replace(
-        map_fit, method="svi", history=np.r_[-1e6, np.linspace(-5, 0, 199)], posterior=None
+        map_fit,
+        posterior=Sampled(map_fit.draws, "svi"),
+        history=np.r_[-1e6, np.linspace(-5, 0, 199)],
     )
     (axes,) = plotting.history(noisy).axes
     x, mean = line(axes, "mean of the last 50")

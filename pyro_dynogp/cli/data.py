@@ -11,7 +11,7 @@ import click
 if TYPE_CHECKING:
     from pyro_dynogp.data.record import Record
     from pyro_dynogp.examples.datasets import Dataset
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.fitting import Fit
 
 # One line for each shipped data set; `pyro-dynogp info NAME` tells the rest.
 DATASETS = {

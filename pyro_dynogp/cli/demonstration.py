@@ -13,13 +13,13 @@ import numpy as np
 
 from pyro_dynogp import plotting
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.discrepancy.loop import close_loop
-from pyro_dynogp.discrepancy.report import Report
 from pyro_dynogp.examples import datasets
-from pyro_dynogp.inference.fit import Fit, fit
+from pyro_dynogp.fitting import Fit, fit
 from pyro_dynogp.models.architectures import LinearDynamicGP
 from pyro_dynogp.prediction.prediction import Prediction
 from pyro_dynogp.prediction.scores import scores
+from pyro_dynogp.report.loop import close_loop
+from pyro_dynogp.report.report import Report
 
 HONEST = (
     "The speed sensor of this machine reports the absolute value of the speed, which no linear "

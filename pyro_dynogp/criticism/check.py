@@ -14,10 +14,11 @@ from pyro_dynogp.criticism.calibration import calibration
 from pyro_dynogp.criticism.finding import Finding, apart
 from pyro_dynogp.criticism.posterior_draws import DRAWS, PosteriorDraws, draws_of, log_joint_of
 from pyro_dynogp.criticism.twin import twin_findings
+from pyro_dynogp.prediction.predict import predict
 from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.inference.fitted import Fitted
 
 # Largest R-hat and fewest effective draws of chains that have mixed (Vehtari et al. 2021).
 R_HAT, EFFECTIVE = 1.01, 400
@@ -66,7 +67,7 @@ class Check:
 
 
 def check(
-    fit: Fit,
+    fit: Fitted,
     *,
     twin: int | Literal[False] = False,
     draws: int = DRAWS,
@@ -121,7 +122,7 @@ def check(
     return Check(tuple(findings), fit.method)
 
 
-def _posterior(fit: Fit, draws: int, seed: int) -> Finding:
+def _posterior(fit: Fitted, draws: int, seed: int) -> Finding:
     own = draws_of(fit, count=draws, seed=seed, anneal=False)
     k = float(arviz_bridge.psis(own.log_ratio)[1])
     good = arviz_bridge.good_k(len(own))
@@ -138,7 +139,7 @@ def _posterior(fit: Fit, draws: int, seed: int) -> Finding:
     return Finding("posterior k", k, True, f"{own.kind}: close to the posterior", good)
 
 
-def _whole_vector(fit: Fit) -> Finding:
+def _whole_vector(fit: Fitted) -> Finding:
     """Trajectories as sites: the ratio of all that the guide draws."""
     values = {**fit.draws, **fit.trajectories}
     argument = fit.records[0] if len(fit.records) == 1 else fit.records
@@ -152,7 +153,7 @@ def _whole_vector(fit: Fit) -> Finding:
     return Finding("whole-vector k", k, None, text)
 
 
-def _chains(fit: Fit) -> list[Finding]:
+def _chains(fit: Fitted) -> list[Finding]:
     r_hat = {k: v for k, v in fit.diagnostics.items() if k.startswith("r_hat ")}
     ess = {k: v for k, v in fit.diagnostics.items() if k.startswith("effective samples ")}
     worst = max(r_hat, key=lambda name: r_hat[name])
@@ -177,7 +178,7 @@ def _chains(fit: Fit) -> list[Finding]:
     ]  # fmt: skip
 
 
-def _elbo(fit: Fit) -> Finding:
+def _elbo(fit: Fitted) -> Finding:
     """Whether the last fifth of the steps lies above the fifth before it, beyond its noise."""
     history = np.asarray(fit.history)
     if len(history) == 1:  # no course to judge
@@ -196,7 +197,7 @@ def _elbo(fit: Fit) -> Finding:
     return Finding("ELBO", float(last.mean()), not still, text)
 
 
-def _starts(fit: Fit) -> Finding:
+def _starts(fit: Fitted) -> Finding:
     energies = np.asarray(fit.start_energies)
     count = int((energies - energies.min() < SAME).sum())
     if len(energies) == 1:
@@ -207,10 +208,10 @@ def _starts(fit: Fit) -> Finding:
     return Finding("starts", float(count), None, text)
 
 
-def _predictions(fit: Fit) -> list[Finding]:
+def _predictions(fit: Fitted) -> list[Finding]:
     findings = []
     for index, record in enumerate(fit.records):
-        found = calibration(fit.predict(record), record)
+        found = calibration(predict(fit, record), record)
         suffix = f" of record {index}" if len(fit.records) > 1 else ""
         p = float(np.min(found.p_value))
         findings.append(

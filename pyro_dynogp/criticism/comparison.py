@@ -12,11 +12,12 @@ import pandas as pd
 from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.loo import Target, loo
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.prediction import predict as predicting
 from pyro_dynogp.prediction.prediction import Parts, Prediction
 from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.inference.fitted import Fitted
 
 # Differences of total elpd below this are small whatever their standard error (Vehtari's
 # cross-validation FAQ), and so many standard errors make one clear.
@@ -72,7 +73,7 @@ class Comparison:
 
 
 def compare(
-    models: Mapping[str, Fit | Any], *, target: Target, method: str = "stacking", **options: Any
+    models: Mapping[str, Fitted | Any], *, target: Target, method: str = "stacking", **options: Any
 ) -> Comparison:
     """Compare models of the same data by their elpd.
 
@@ -169,20 +170,24 @@ class Stack:
         fits: by name. weights: by name, they add up to one.
     """
 
-    fits: Mapping[str, Fit]
+    fits: Mapping[str, Fitted]
     weights: Mapping[str, float]
 
     def simulate(self, record: Record, **options: Any) -> Prediction:
         """As `Fit.simulate`."""
-        return self._mix([fit.simulate(record, **options) for fit in self.fits.values()])
+        return self._mix(
+            [predicting.simulate(fit, record, **options) for fit in self.fits.values()]
+        )
 
     def predict(self, record: Record, **options: Any) -> Prediction:
         """As `Fit.predict`."""
-        return self._mix([fit.predict(record, **options) for fit in self.fits.values()])
+        return self._mix([predicting.predict(fit, record, **options) for fit in self.fits.values()])
 
     def forecast(self, past: Record, future: Record, **options: Any) -> Prediction:
         """As `Fit.forecast`."""
-        return self._mix([fit.forecast(past, future, **options) for fit in self.fits.values()])
+        return self._mix(
+            [predicting.forecast(fit, past, future, **options) for fit in self.fits.values()]
+        )
 
     def _mix(self, predictions: Sequence[Prediction]) -> Prediction:
         weights = np.array([self.weights[name] for name in self.fits])
@@ -190,7 +195,7 @@ class Stack:
 
 
 def stack(
-    fits: Mapping[str, Fit], weights: Comparison | Mapping[str, float] | None = None,
+    fits: Mapping[str, Fitted], weights: Comparison | Mapping[str, float] | None = None,
     *, target: Target | None = None, **options: Any,
 ) -> Stack:  # fmt: skip
     """Predict with several fits, weighted by what left-out data say of them.

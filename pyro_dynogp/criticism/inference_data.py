@@ -16,7 +16,7 @@ from torch import Tensor
 from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.labelled import Coordinate, Variable, clock_of, dataset_of, units_of
 from pyro_dynogp.criticism.physical import physical_quantities
-from pyro_dynogp.criticism.posterior_draws import PosteriorDraws, log_joint, with_draws
+from pyro_dynogp.criticism.posterior_draws import PosteriorDraws, judged
 from pyro_dynogp.criticism.site_dimensions import (
     dimensions_for,
     labels_of,
@@ -25,16 +25,16 @@ from pyro_dynogp.criticism.site_dimensions import (
 )
 from pyro_dynogp.criticism.subjects import densities_at
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.inference.posteriors import MixtureGuide
 from pyro_dynogp.models.output_process import OutputProcess
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.prediction.first_state import beginning
+from pyro_dynogp.prediction.predict import forecast, simulate
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.parallel import seeded
 from pyro_dynogp.support.version import __version__
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.inference.fitted import Fitted
 
 NOT_FOR_LOO = (
     "One-step-ahead densities p(y_i | outputs before y_i, draw), trajectories integrated out: they "
@@ -44,7 +44,7 @@ NOT_FOR_LOO = (
 
 
 def to_arviz(
-    fit: Fit,
+    fit: Fitted,
     *,
     future: Record | None = None,
     samples: int = 200,
@@ -81,7 +81,7 @@ class _Export:
         fit: the fit. samples: number of replicates and of predictions. seed: for all draws.
     """
 
-    fit: Fit
+    fit: Fitted
     samples: int
     seed: int
 
@@ -115,12 +115,12 @@ class _Export:
         }
 
     @property
-    def thinned(self) -> Fit:
+    def thinned(self) -> Fitted:
         """At most `samples` draws, spread evenly over all of them."""
         if self.count <= self.samples:
             return self.fit
         index = np.linspace(0, self.count - 1, self.samples).round().astype(int)
-        return with_draws(self.fit, {k: v[index] for k, v in self.fit.draws.items()})
+        return self.fit.with_draws({k: v[index] for k, v in self.fit.draws.items()})
 
     def posterior(self) -> xr.Dataset:
         """Every latent site, trajectories too, and what follows from them in physical units."""
@@ -137,7 +137,7 @@ class _Export:
         note = "outputs from the inputs alone, jointly, at prior draws"
         return {
             "prior": dataset_of(self._sites(values) | derived, self.labels, {}, chains=1),
-            "prior_predictive": self.replicates(with_draws(fit, values), count, note),
+            "prior_predictive": self.replicates(fit.with_draws(values), count, note),
         }
 
     def _sites(self, values: Mapping[str, Tensor]) -> dict[str, Variable]:
@@ -154,18 +154,18 @@ class _Export:
         units = units_of(self.fit.scaling.output_units)
         return Variable(values, (f"time{suffix}", "output"), units)
 
-    def replicates(self, fit: Fit, samples: int, note: str) -> xr.Dataset:
+    def replicates(self, fit: Fitted, samples: int, note: str) -> xr.Dataset:
         """Joint samples of the outputs of each training record from its inputs alone."""
         drawn = {}
         for suffix, record in zip(suffixes_of(fit.records), fit.records, strict=True):
-            found = fit.simulate(record, samples=samples, seed=self.seed)
+            found = simulate(fit, record, samples=samples, seed=self.seed)
             drawn[f"y{suffix}"] = self._outputs(suffix, found.samples)
         return dataset_of(drawn, self.labels, {"kind": note}, chains=1)
 
     def predictions(self, future: Record) -> dict[str, xr.Dataset]:
         """Forecast of a later record, which has a clock of its own."""
         past = self.fit.records[-1]
-        found = self.thinned.forecast(past, future, samples=self.samples, seed=self.seed)
+        found = forecast(self.thinned, past, future, samples=self.samples, seed=self.seed)
         labels = self.labels | clock_of(future)
         y = {"y": self._outputs("", found.samples)}
         note = {"kind": "forecast after the last training record, from its state and the inputs"}
@@ -233,22 +233,12 @@ def pareto_attrs(draws: PosteriorDraws) -> dict[str, Any]:
     }
 
 
-def exported_draws(fit: Fit) -> PosteriorDraws:
+def exported_draws(fit: Fitted) -> PosteriorDraws:
     """The draws that a fit holds, with their densities; no density for MAP and NUTS draws."""
-    count = len(next(iter(fit.draws.values())))
-    group = np.zeros(count, dtype=int)
-    log_q = None
-    if fit.posterior is not None:
-        log_q = fit.posterior.log_prob(fit.draws).numpy()
-        if isinstance(fit.posterior, MixtureGuide):
-            group = fit.posterior.optimum(fit.draws).numpy()
-    elif fit.log_q_sites:
-        own = [v.numpy() for name, v in fit.log_q_sites.items() if name not in fit.trajectories]
-        log_q = np.sum(own, axis=0)
-    return PosteriorDraws(fit.draws, log_joint(fit, fit.draws), log_q, group, fit.method)
+    return judged(fit, fit.posterior.rated(fit.draws), fit.method)
 
 
-def prior_draws(fit: Fit, count: int, seed: int) -> tuple[dict[str, Tensor], Any]:
+def prior_draws(fit: Fitted, count: int, seed: int) -> tuple[dict[str, Tensor], Any]:
     """Draws (S, *shape) of the sites of a fit from the prior of its model, and the system there.
 
     Args:
@@ -268,10 +258,10 @@ def prior_draws(fit: Fit, count: int, seed: int) -> tuple[dict[str, Tensor], Any
     return {name: tracer.trace.nodes[name]["value"] for name in fit.draws}, system
 
 
-def one_step_densities(fit: Fit, record: Record) -> np.ndarray:
+def one_step_densities(fit: Fitted, record: Record) -> np.ndarray:
     """Log-density (S, n, n_y) [nats] of each output given those before it, at each draw."""
 
-    def observed(some: Fit) -> OutputProcess:
+    def observed(some: Fitted) -> OutputProcess:
         return output_process(beginning(some, record), some.scaling, record)
 
     return densities_at(fit, fit.draws, record, observed, "forecast")

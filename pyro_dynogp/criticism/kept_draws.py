@@ -6,7 +6,7 @@ from collections.abc import Callable, Hashable
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.inference.fitted import Fitted
 
 Found = TypeVar("Found")
 NAME = "_kept_draws"
@@ -19,7 +19,7 @@ class Kept(dict[Hashable, Any]):
         return Kept, ()
 
 
-def kept(fit: Fit, key: Hashable, compute: Callable[[], Found]) -> Found:
+def kept(fit: Fitted, key: Hashable, compute: Callable[[], Found]) -> Found:
     """What `compute` gives, computed the first time that this fit is asked for `key`.
 
     It lives in the fit's own dictionary, as a `cached_property` does: it goes when the fit goes,

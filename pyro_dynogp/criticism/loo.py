@@ -16,7 +16,7 @@ from pyro_dynogp.data.records import as_records
 from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.inference.fitted import Fitted
 
 Target = Literal["missing sample", "forecast", "new record"]
 TARGETS = get_args(Target)
@@ -25,7 +25,7 @@ MOST_REFITS = 30
 
 
 def loo(
-    fit: Fit | Subject,
+    fit: Fitted | Subject,
     record: Record | Sequence[Record] | None = None,
     *,
     target: Target,
@@ -107,9 +107,9 @@ def subject_of(
     progress: bool = False,
 ) -> Subject:
     """What `loo` works on."""
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.inference.fitted import Fitted
 
-    if not isinstance(fit, Fit):
+    if not isinstance(fit, Fitted):
         if not all(hasattr(fit, name) for name in ("draws", "pointwise", "places", "data")):
             raise invalid("fit", expected="a Fit, or a Subject", got=type(fit).__name__)
         return fit

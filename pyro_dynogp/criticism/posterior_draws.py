@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from types import MappingProxyType
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,13 +18,14 @@ from pyro_dynogp.criticism.kept_draws import kept
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.density import Potential, log_prob_by_draw
 from pyro_dynogp.inference.methods import annealed as annealing
-from pyro_dynogp.inference.posteriors import GaussianGuide, MixtureGuide, gaussian_guide
+from pyro_dynogp.inference.posteriors import Draws, Mixture
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
 from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import seeded
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.inference.fitted import Fitted
 
 Values = Mapping[str, Tensor]
 # Draws that `check` and `loo` take where they are not told: the same, so that their k agree.
@@ -80,7 +80,7 @@ class PosteriorDraws:
 
 
 def draws_of(
-    fit: Fit, *, count: int = DRAWS, seed: int = 0, anneal: bool = True, progress: bool = False
+    fit: Fitted, *, count: int = DRAWS, seed: int = 0, anneal: bool = True, progress: bool = False
 ) -> PosteriorDraws:
     """Draws of all parameters of a fit, computed once and kept with it.
 
@@ -98,7 +98,7 @@ def draws_of(
     Raises:
         ValueError: where draws are to be annealed around the mode of a cascade.
     """
-    if anneal and fit.method != "nuts" and not isinstance(fit.posterior, MixtureGuide):
+    if anneal and fit.method != "nuts" and not _of_optima(fit):
         own = draws_of(fit, count=count, seed=seed, anneal=False)
         if fit.log_q_sites:
             return own
@@ -110,66 +110,50 @@ def draws_of(
     return kept(fit, ("own", count, seed), lambda: _own(fit, count, seed))
 
 
-def _own(fit: Fit, count: int, seed: int) -> PosteriorDraws:
-    """Draws of what the fit holds itself."""
+def _own(fit: Fitted, count: int, seed: int) -> PosteriorDraws:
+    """Draws of what the fit holds itself; of a mode, of the normal around it."""
     if fit.method == "nuts":
         n = len(next(iter(fit.draws.values())))
         return PosteriorDraws(fit.draws, None, None, np.zeros(n, dtype=int), "NUTS")
-    if fit.log_q_sites:
-        log_q = sum(v for name, v in fit.log_q_sites.items() if name not in fit.trajectories)
-        assert isinstance(log_q, Tensor)
-        return PosteriorDraws(
-            fit.draws,
-            log_joint(fit, fit.draws),
-            log_q.numpy(),
-            np.zeros(len(log_q), dtype=int),
-            "SVI with trajectories as sites",
-        )
-    if isinstance(fit.posterior, MixtureGuide):
-        return _of_optima(fit, fit.posterior, count, seed)
-    return _of_normal(fit, count, seed)
+    if fit.method == "map":
+        return judged(fit, normal_of(fit).draws(count, seed), "Laplace's approximation")
+    return judged(fit, fit.posterior.draws(count, seed))
 
 
-def _of_optima(fit: Fit, guide: MixtureGuide, count: int, seed: int) -> PosteriorDraws:
-    with seeded(seed), torch.no_grad(), pyro.plate("draws", count, dim=-1):
-        trace = pyro.poutine.trace(guide).get_trace()
-    values = {name: trace.nodes[name]["value"] for name in fit.draws}
-    return PosteriorDraws(
-        MappingProxyType(values),
-        log_joint(fit, values),
-        guide.log_prob(values).numpy(),
-        guide.optimum(values).numpy(),
-        f"SVI, {len(guide.weights)} optima, hyperparameters at each optimum",
-    )
+def _of_optima(fit: Fitted) -> bool:
+    """Whether hyperparameters are at points, so that one normal is not what the fit is."""
+    return bool(fit.method == "svi" and isinstance(fit.posterior, Mixture) and fit.posterior.points)
 
 
-def laplace(fit: Fit, values: Values) -> GaussianGuide:
+def judged(fit: Fitted, draws: Draws, kind: str | None = None) -> PosteriorDraws:
+    """Draws of a fit's posterior with the log joint density of each.
+
+    Args:
+        fit: whose model and records say the density. draws: of its posterior.
+        kind: where they come from, if not what the draws say themselves.
+    """
+    log_q = None if draws.log_q is None else draws.log_q.numpy()
+    log_p = log_joint(fit, draws.values)
+    return PosteriorDraws(draws.values, log_p, log_q, draws.group.numpy(), kind or draws.kind)
+
+
+def laplace(fit: Fitted, values: Values) -> Mixture:
     """Normal around an optimum, from the Hessian of the log joint density there."""
     with seeded(fit.seed):
         potential = Potential(fit.model.collapsed, (_argument(fit.records),), values)
         centre, root = potential.laplace(values, widest=WIDEST)
-    return gaussian_guide(potential, torch.as_tensor(centre), torch.as_tensor(root))
+    return Mixture.normal(potential, torch.as_tensor(centre), torch.as_tensor(root))
 
 
-def normal_of(fit: Fit) -> GaussianGuide:
+def normal_of(fit: Fitted) -> Mixture:
     """The normal that a fit is: its variational posterior, or Laplace's around its mode."""
-    if isinstance(fit.posterior, GaussianGuide):
+    if isinstance(fit.posterior, Mixture) and fit.posterior.sites and not fit.posterior.points:
         return fit.posterior
     return kept(fit, "laplace", lambda: laplace(fit, fit.mode))
 
 
-def _of_normal(fit: Fit, count: int, seed: int) -> PosteriorDraws:
-    normal = normal_of(fit)
-    with seeded(seed), torch.no_grad():
-        noise = torch.randn(count, len(normal.loc), dtype=torch.float64)
-        values = MappingProxyType(normal.values_at(normal.loc + noise @ normal.scale_tril.mT))
-        log_q = normal.log_prob(values).numpy()
-    kind = "Laplace's approximation" if fit.posterior is None else "SVI, multivariate normal"
-    return PosteriorDraws(values, log_joint(fit, values), log_q, np.zeros(count, dtype=int), kind)
-
-
 def _annealed(
-    fit: Fit, own: PosteriorDraws, k: float, count: int, seed: int, progress: bool
+    fit: Fitted, own: PosteriorDraws, k: float, count: int, seed: int, progress: bool
 ) -> PosteriorDraws:
     """Draws of the posterior where the fit's own normal, of Pareto shape k, will not do."""
     shape = apart(k, arviz_bridge.good_k(count))[0]
@@ -188,7 +172,7 @@ def _annealed(
     target = annealing.Joint(fit.model.collapsed, (_argument(fit.records),), normal.sites)
     with seeded(seed):
         annealed = annealing.anneal(z, start, target, seed=seed, progress=progress)
-        values = MappingProxyType(normal.values_at(annealed.z))
+        values = FrozenMapping(normal.at_latent(annealed.z))
     return PosteriorDraws(
         values,
         log_joint(fit, values),
@@ -199,7 +183,7 @@ def _annealed(
     )
 
 
-def log_joint(fit: Fit, values: Values) -> np.ndarray:
+def log_joint(fit: Fitted, values: Values) -> np.ndarray:
     """Log p(y, values) (S,) of draws, y the training records; -inf where it has no value."""
     return log_joint_of(
         fit.model.collapsed, (_argument(fit.records),), values, _samples(fit.records)
@@ -246,14 +230,6 @@ def _portion(model: Any, args: tuple[Any, ...], values: Values) -> np.ndarray:
             raise invalid("values", expected=f"draws of every site, {name!r} too", got="none of it")
     total = log_prob_by_draw(trace, count).numpy()
     return np.where(np.isfinite(total), total, -np.inf)
-
-
-def with_draws(fit: Fit, values: Values) -> Fit:
-    """The fit with other draws, for what is computed from draws alone.
-
-    What it says of its own guide's draws (`log_q_sites`) stays: whether trajectories were sites.
-    """
-    return replace(fit, draws=values, posterior=None, trajectories={})
 
 
 def _argument(records: Sequence[Record]) -> Any:

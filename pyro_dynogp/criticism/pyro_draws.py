@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.criticism.posterior_draws import PosteriorDraws
-from pyro_dynogp.inference.posteriors import DrawsGuide, MixtureGuide
+from pyro_dynogp.inference.posteriors import Mixture, Sampled
 from pyro_dynogp.support.errors import invalid
 
 Nodes = dict[str, Any]
@@ -27,8 +27,8 @@ def draws_of_any(
     Raises:
         ValueError: where it is none of these, is empty, or draws differ in number or shape.
     """
-    if isinstance(posterior, DrawsGuide):  # what it holds, instead of some of it
-        posterior = posterior.draws
+    if isinstance(posterior, Sampled):  # what it holds, instead of some of it
+        posterior = posterior.values
     if callable(getattr(posterior, "get_samples", None)):
         samples = {
             k: torch.as_tensor(v) for k, v in posterior.get_samples(group_by_chain=True).items()
@@ -62,8 +62,8 @@ def _of_guide(guide: Any, args: tuple[Any, ...], count: int) -> PosteriorDraws:
         # A point has no density to compare with that of the posterior.
         return PosteriorDraws(values, None, None, np.zeros(count, dtype=int), "point estimate")
     group = np.zeros(count, dtype=int)
-    if isinstance(guide, MixtureGuide):
-        group = guide.optimum(values).numpy()
+    if isinstance(guide, Mixture):
+        group = guide.component(values).numpy()
     return PosteriorDraws(values, None, log_q, group, "guide")
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 
 import numpy as np
 import pandas as pd
 
 from pyro_dynogp.criticism.ranks import Uniformity, holm, uniformity
+from pyro_dynogp.support.frozen import FrozenMapping
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,8 +141,8 @@ def judged(
         replicates=count + len(failures),
         draws=draws,
         level=level,
-        ranks=MappingProxyType(dict(ranks)),
-        tests=MappingProxyType(tests),
-        p_adjusted=MappingProxyType(dict(zip(tests, adjusted.tolist(), strict=True))),
+        ranks=FrozenMapping(dict(ranks)),
+        tests=FrozenMapping(tests),
+        p_adjusted=FrozenMapping(dict(zip(tests, adjusted.tolist(), strict=True))),
         failures=failures,
     )

@@ -16,17 +16,19 @@ from pyro_dynogp.criticism.posterior_draws import draws_of, log_joint
 from pyro_dynogp.criticism.rank_results import SimulationBasedCalibration, judged
 from pyro_dynogp.criticism.ranks import rank_of
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.inference.fit import fit
+from pyro_dynogp.inference.training import train_model
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.parallel import child_seeds, parallel_map, seeded
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.inference.fitted import Fitted
 
 JOINT = "log joint"
 # NUTS draws so many times as many as are kept, so that those are nearly independent.
 THIN = 5
+# Arguments of `fit` that every method takes.
+SHARED = ("start", "restarts", "steps", "checkpoint")
 
 
 class _Fixed(Model):
@@ -201,19 +203,21 @@ def _simulated(task: _Task) -> tuple[dict[str, Tensor], Record]:
     return sites, task.blank.with_outputs(y, names=names, units=units)
 
 
-def _fitted(task: _Task, record: Record) -> Fit:
+def _fitted(task: _Task, record: Record) -> Fitted:
     options: dict[str, Any] = dict(task.options)
     if task.method == "nuts":
         chains = options.get("chains", 4)
         options["draws"] = -(-THIN * task.draws // chains)
     elif task.method == "svi":
         options["draws"] = task.draws
-    return fit(
-        task.model, record, method=task.method, seed=task.seed, workers=1, progress=False, **options
-    )
+    loose = {name: options.pop(name) for name in list(options) if name not in SHARED}
+    return train_model(
+        task.model, record, method=task.method, options=loose, seed=task.seed, workers=1,
+        progress=False, **options,
+    )  # fmt: skip
 
 
-def _ranked(task: _Task, truth: Mapping[str, Tensor], fitted: Fit) -> _Outcome:
+def _ranked(task: _Task, truth: Mapping[str, Tensor], fitted: Fitted) -> _Outcome:
     generator = np.random.default_rng(task.seed)
     own = draws_of(fitted, count=task.draws, seed=task.seed, anneal=False)
     known = {name: truth[name].unsqueeze(0) for name in own.values}

@@ -17,7 +17,6 @@ from pyro_dynogp.criticism.posterior_draws import (
     PosteriorDraws,
     Values,
     draws_of,
-    with_draws,
 )
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.refit import refit
@@ -26,7 +25,7 @@ from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.inference.fitted import Fitted
 
 
 Parameters = Literal["posterior", "mode"]
@@ -68,7 +67,7 @@ class FitSubject:
         progress: whether drawing shows a bar where it takes long.
     """
 
-    fit: Fit
+    fit: Fitted
     records: tuple[Record, ...]
     count: int
     seed: int
@@ -113,7 +112,7 @@ class FitSubject:
     def _along(self, record: Record, index: int | None, kind: Kind, horizon: int) -> np.ndarray:
         """Densities of a record's measured samples."""
 
-        def observed(part: Fit) -> OutputProcess:
+        def observed(part: Fitted) -> OutputProcess:
             return observed_of(part, record, index)
 
         found = densities_at(self.fit, self.draws.values, record, observed, kind, horizon)
@@ -136,10 +135,10 @@ class FitSubject:
 
 
 def densities_at(
-    fit: Fit,
+    fit: Fitted,
     values: Values,
     record: Record,
-    observed: Callable[[Fit], OutputProcess],
+    observed: Callable[[Fitted], OutputProcess],
     kind: Kind,
     horizon: int = 1,
 ) -> np.ndarray:
@@ -155,13 +154,13 @@ def densities_at(
     portion = max(1, AT_ONCE // (len(record) * record.n_outputs))
     parts = []
     for first in range(0, count, portion):
-        some = with_draws(fit, {k: v[first : first + portion] for k, v in values.items()})
+        some = fit.with_draws({k: v[first : first + portion] for k, v in values.items()})
         with torch.no_grad():
             parts.append(pointwise_log_density(observed(some), y, kind, horizon=horizon))
     return np.concatenate(parts)
 
 
-def observed_of(fit: Fit, record: Record, index: int | None) -> OutputProcess:
+def observed_of(fit: Fitted, record: Record, index: int | None) -> OutputProcess:
     """Distribution of a record's outputs for each draw of a fit.
 
     Args:

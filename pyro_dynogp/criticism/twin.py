@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,15 +12,16 @@ from pyro.ops.stats import split_gelman_rubin
 from torch import Tensor
 
 from pyro_dynogp.criticism.finding import Finding, apart
-from pyro_dynogp.criticism.posterior_draws import draws_of, log_joint, with_draws
+from pyro_dynogp.criticism.posterior_draws import draws_of, log_joint
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.methods.nuts import Chains, sample_posterior
 from pyro_dynogp.inference.refit import refit
+from pyro_dynogp.prediction.predict import predict
 from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.inference.fitted import Fitted
 
 FEWEST = 20
 # What is good enough. A mean that is off by 0.2 sd, or an sd by a factor 1.2, costs 0.02 nats of a
@@ -58,7 +58,7 @@ class Gap:
 
 
 def twin_findings(
-    fit: Fit,
+    fit: Fitted,
     samples: int,
     *,
     seed: int = 0,
@@ -115,7 +115,7 @@ def twin_findings(
     ]
 
 
-def _first(fit: Fit, samples: int) -> list[Record]:
+def _first(fit: Fitted, samples: int) -> list[Record]:
     """The first samples of the training record; of several records, the same share of each."""
     if not fit.collapsed:
         raise invalid(
@@ -142,7 +142,7 @@ def _first(fit: Fit, samples: int) -> list[Record]:
     return parts
 
 
-def _settled(fit: Fit, drawn: Mapping[str, Tensor], effort: Effort) -> float:
+def _settled(fit: Fitted, drawn: Mapping[str, Tensor], effort: Effort) -> float:
     """R-hat of the log joint density, which pairs that swap do not change."""
     level = torch.as_tensor(log_joint(fit, drawn)).reshape(effort.chains, effort.draws)
     return float(split_gelman_rubin(level))
@@ -172,15 +172,15 @@ def _sites(potential: Potential, own: Mapping[str, Tensor], chains: Chains) -> t
     return Gap(tuple(names), np.array(means), np.array(ratios)), left
 
 
-def _predictions(fit: Fit, drawn: Mapping[str, Tensor]) -> Gap:
+def _predictions(fit: Fitted, drawn: Mapping[str, Tensor]) -> Gap:
     """Every measured output, one step ahead."""
     count = len(next(iter(drawn.values())))
     thin = np.linspace(0, count - 1, min(count, MOST)).round().astype(int)
-    sampled = with_draws(fit, MappingProxyType({name: x[thin] for name, x in drawn.items()}))
+    sampled = fit.with_draws({name: x[thin] for name, x in drawn.items()})
     names: list[str] = []
     means, ratios = [], []
     for record in fit.records:
-        ours, theirs = fit.predict(record), sampled.predict(record)
+        ours, theirs = predict(fit, record), predict(sampled, record)
         there = ~record.missing
         names += [f"sample {k}" for k in np.argwhere(there)[:, 0]]
         means.append(((ours.mean - theirs.mean) / theirs.sd)[there])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any, TypedDict
 
 from pyro_dynogp.data.checks import (
@@ -17,6 +16,7 @@ from pyro_dynogp.data.checks import (
     read_clock,
 )
 from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.frozen import FrozenMapping
 
 
 class RecordFields(TypedDict):
@@ -72,8 +72,8 @@ def checked(fields: RecordFields) -> dict[str, Any]:
             "output_units", fields["output_units"], len(y_names), unique=False
         ),
         "time_unit": time_unit,
-        "extra": MappingProxyType({k: frozen(v) for k, v in kept.items()}),
-        "extra_units": MappingProxyType({k: extra_units.get(k, "") for k in kept}),
+        "extra": FrozenMapping({k: frozen(v) for k, v in kept.items()}),
+        "extra_units": FrozenMapping({k: extra_units.get(k, "") for k in kept}),
         "name": str(fields["name"]),
         "start": origin,
     }

@@ -15,7 +15,7 @@ from pyro_dynogp.prediction.records import gap_between, joined
 from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.fitting import Fit
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,7 @@ from pyro_dynogp.statistics.evidence import Residuals
 from pyro_dynogp.statistics.omnibus import Beyond, beyond_catalogue, structure_left
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.fitting import Fit
 
 
 class Stopwatch:

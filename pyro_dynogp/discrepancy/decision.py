@@ -11,11 +11,11 @@ import numpy as np
 
 from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.discrepancy.report import Attempt
+from pyro_dynogp.discrepancy.result import Attempt
 from pyro_dynogp.discrepancy.search import Candidate, Found
 from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
 from pyro_dynogp.discrepancy.trials import Score, Trial, Tried, interleaved, run
-from pyro_dynogp.inference.fitted import Fit
+from pyro_dynogp.fitting import Fit
 from pyro_dynogp.models.variants import Model
 from pyro_dynogp.support.parallel import parallel_map
 

@@ -21,7 +21,7 @@ from pyro_dynogp.models.delays import where_inputs_are_known
 from pyro_dynogp.models.model import Model
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.fitting import Fit
 
 DRAWS = 200
 # Beyond how many times a delay, and how many steps more, others are not expected; and the share of

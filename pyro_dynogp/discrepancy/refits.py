@@ -9,10 +9,9 @@ import numpy as np
 import torch
 
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.fitting import Fit
 from pyro_dynogp.inference.density import Potential
-from pyro_dynogp.inference.fit import at_optimum
-from pyro_dynogp.inference.fitted import Fit
-from pyro_dynogp.inference.methods.mode import climb, grow, starting_points
+from pyro_dynogp.inference.methods.mode import at_optimum, climb, grow, starting_points
 from pyro_dynogp.inference.optimise.descent import descend
 from pyro_dynogp.inference.optimise.lockstep import Functions
 from pyro_dynogp.inference.optimise.maximum import Optimum, maximise
@@ -72,7 +71,7 @@ def quick_fit(
         optima = _grown(scaled, records, seed, base, WARM_STEPS, FILLING_STEPS)
     else:
         optima = _fresh(scaled, records, seed)
-    return at_optimum(scaled, optima, seed, records)
+    return Fit.of(at_optimum(scaled, optima, seed, records))
 
 
 def race(
@@ -98,7 +97,7 @@ def race(
             scaled, records = _scaled(model, record)
             if not scaled.is_linear:
                 optima = _grown(scaled, records, seed, base, FIRST_STEPS, FIRST_STEPS // 3)
-                found.append(at_optimum(scaled, optima, seed, records))
+                found.append(Fit.of(at_optimum(scaled, optima, seed, records)))
             else:
                 beginnings.append((scaled, records, _warm_starts(scaled, records, seed, base)))
         except ValueError as error:  # for instance a channel that is constant there
@@ -168,7 +167,7 @@ def _side_by_side(beginnings: Sequence[_Beginning], steps: int, seed: int) -> li
     runs = [run(one, starts) for one, (_, _, starts) in zip(potentials, beginnings, strict=True)]
     optima = each_in_lockstep(potentials, runs, jacobian=False)
     return [
-        at_optimum(model, [optimum], seed, records)
+        Fit.of(at_optimum(model, [optimum], seed, records))
         for optimum, (model, records, _) in zip(optima, beginnings, strict=True)
     ]
 
@@ -179,7 +178,7 @@ def _further(found: Fit, seed: int) -> Fit:
         found.model.collapsed, found.records[0], [dict(found.mode)], optimizer="preconditioned",
         steps=MORE_STEPS, seed=seed, workers=1, near=True,
     )  # fmt: skip
-    return at_optimum(found.model, optima, seed, found.records)
+    return Fit.of(at_optimum(found.model, optima, seed, found.records))
 
 
 def _linear(

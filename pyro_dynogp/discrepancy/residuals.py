@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pyro_dynogp.criticism.posterior_draws import draws_of, with_draws
+from pyro_dynogp.criticism.posterior_draws import draws_of
 from pyro_dynogp.data.channels import count_direct
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
@@ -17,7 +17,7 @@ from pyro_dynogp.statistics.evidence import Residuals
 from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.fitting import Fit
 
 
 def residuals_of(
@@ -52,7 +52,7 @@ def residuals_of(
     prepared = fit.model.check(record)[0]
     if fit.method == "map":
         drawn = draws_of(fit, count=settings.draws, seed=seed, anneal=False)
-        spread = with_draws(fit, drawn.values)
+        spread = fit.with_draws(drawn.values)
     else:
         spread = fit
     options = {} if fit.model.is_linear else {"process_noise": False}

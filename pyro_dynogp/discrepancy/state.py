@@ -11,7 +11,7 @@ from pyro_dynogp.discrepancy.context import SearchContext, Stopwatch, Tested
 from pyro_dynogp.discrepancy.data_faults import data_spikes
 from pyro_dynogp.discrepancy.decision import Confirmed
 from pyro_dynogp.discrepancy.refits import quick_fit
-from pyro_dynogp.discrepancy.report import Attempt
+from pyro_dynogp.discrepancy.result import Attempt
 from pyro_dynogp.discrepancy.search import Candidate, Found, candidates_of
 from pyro_dynogp.discrepancy.trials import without
 from pyro_dynogp.effects.base import OUTSIDE
@@ -19,7 +19,7 @@ from pyro_dynogp.models.variants import Model, has_process_noise
 from pyro_dynogp.statistics.evidence import Residuals
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.fitting import Fit
 
 FED_BACK = "inputs are under feedback, for which the residual speaks more clearly"
 OTHERS = "others are more probable, or no block of the model stands for it"

@@ -14,7 +14,7 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.refits import energy, poles_of, quick_fit, race
 from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
 from pyro_dynogp.effects.base import Compared, Score
-from pyro_dynogp.inference.fitted import Fit
+from pyro_dynogp.fitting import Fit
 from pyro_dynogp.models.delays import comparable
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.variants import Model

@@ -14,7 +14,7 @@ from pyro_dynogp.models.variants import Model
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.fitting import Fit
 
 # Densities on which an effect must pay.
 Score = Literal["one step", "forecast"]

@@ -31,7 +31,7 @@ from pyro_dynogp.statistics.regression import with_past
 from pyro_dynogp.statistics.scan import tail_probability
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.fitting import Fit
 
 # Exact ties as improbable as this are a limit, and name it.
 TIED = 0.01

@@ -2,34 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.inference.fit import draws_of_guide
-from pyro_dynogp.inference.fitted import Fit
+from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.nuts import sample_posterior
-from pyro_dynogp.inference.methods.optima import Hyperparameters, posterior_of
+from pyro_dynogp.inference.methods.optima import (
+    POLISH,
+    Hyperparameters,
+    free_sites,
+    posterior_of,
+)
 from pyro_dynogp.inference.optimise.maximum import Optimum, maximise
-from pyro_dynogp.inference.posteriors import GaussianGuide, MixtureGuide
-from pyro_dynogp.support.checkpoints import NOTHING_KEPT
+from pyro_dynogp.inference.posteriors import Mixture, Sampled, draws_of_guide
+from pyro_dynogp.inference.run import Run
 from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import seeded
 
 # Iterations from the old optimum: of L-BFGS, of Adam, of SVI for all sites.
 LINEAR_STEPS, CASCADE_STEPS, SVI_STEPS = 300, 200, 400
 # Adam's first step: the old optimum is close by.
 REFIT_RATE = 0.004
+FittedKind = TypeVar("FittedKind", bound=Fitted)
 # Of NUTS, whose chains start at the mode.
 WARMUP = 300
 
 
-def refit(fit: Fit, records: Record | Sequence[Record]) -> Fit:
+def refit(fit: FittedKind, records: Record | Sequence[Record]) -> FittedKind:
     """Fit again by the same method, beginning at the optima of the old fit, in this process.
 
     The scaling, and with it every prior, stays that of the old fit: what changes is the data alone.
@@ -57,7 +63,7 @@ def refit(fit: Fit, records: Record | Sequence[Record]) -> Fit:
     optima = maximise(
         target,
         argument,
-        [dict(values) for values in optima_of(fit)],
+        optima_of(fit),
         optimizer="adam" if cascade else "lbfgs",
         steps=CASCADE_STEPS if cascade else LINEAR_STEPS,
         seed=fit.seed,
@@ -67,62 +73,55 @@ def refit(fit: Fit, records: Record | Sequence[Record]) -> Fit:
     )
     best = optima[0]
     changed: dict[str, Any] = {
-        "mode": MappingProxyType(best.values),
+        "mode": FrozenMapping(best.values),
         "history": best.history,
         "records": several,
-        "trajectories": {},
     }
     if fit.method == "map":
         draws = {name: value.unsqueeze(0) for name, value in best.values.items()}
-        return replace(fit, draws=MappingProxyType(draws), **changed)
+        changed |= {"posterior": Mixture.at(best.values), "draws": FrozenMapping(draws)}
+        return replace(fit, **changed)
     if fit.method == "nuts":
-        draws = _sampled(fit, target, argument, best)
-        return replace(fit, draws=MappingProxyType(draws), **changed)
+        sampled = FrozenMapping(_sampled(fit, target, argument, best))
+        return replace(fit, posterior=Sampled(sampled), draws=sampled, **changed)
     family = family_of(fit)
+    run = Run(fit.seed, workers=1)
     found = posterior_of(
         target,
         argument,
         optima,
         family,
-        steps=60 if family == "map" else SVI_STEPS,
-        particles=8,
-        learning_rate=0.02,
-        seed=fit.seed,
-        workers=1,
-        checkpoints=NOTHING_KEPT,
-        progress=False,
+        free=free_sites(Problem(fit.model, several)),
+        steps=POLISH if family == "map" else SVI_STEPS,
+        run=run,
     )
-    changed |= {"mode": MappingProxyType(dict(found.mode)), "history": found.elbo}
+    changed |= {"mode": FrozenMapping(found.mode), "history": found.elbo}
     count = len(next(iter(fit.draws.values())))
     with seeded(fit.seed):
-        draws = draws_of_guide(found.guide, argument, count, best.values)
-    return replace(fit, draws=MappingProxyType(draws), posterior=found.guide, **changed)
+        drawn = draws_of_guide(found.guide, count)
+    draws = {name: drawn[name] for name in best.values}
+    return replace(fit, draws=FrozenMapping(draws), posterior=found.guide, **changed)
 
 
-def optima_of(fit: Fit) -> list[Mapping[str, Tensor]]:
+def optima_of(fit: Fitted) -> list[dict[str, Tensor]]:
     """Values of all sites at each optimum that a fit consists of, the leading one first."""
     posterior = fit.posterior
-    if not isinstance(posterior, MixtureGuide):
-        return [fit.mode]
-    found: list[Mapping[str, Tensor]] = []
-    for k in range(len(posterior.weights)):
-        centre = GaussianGuide(posterior.loc[k], posterior.scale_tril[k], posterior.sites)
-        points = {name: x[k] for name, x in posterior.points.items()}
-        found.append({**points, **centre.values_at(posterior.loc[k])})
-    return found
+    if isinstance(posterior, Mixture) and posterior.points and posterior.sites:
+        return posterior.centres
+    return [dict(fit.mode)]
 
 
-def family_of(fit: Fit) -> Hyperparameters:
+def family_of(fit: Fitted) -> Hyperparameters:
     """What `fit` was told about hyperparameters."""
-    if isinstance(fit.posterior, MixtureGuide):
+    assert isinstance(fit.posterior, Mixture)
+    if fit.posterior.points:
         return "map"
-    assert isinstance(fit.posterior, GaussianGuide)
-    root = fit.posterior.scale_tril
+    root = fit.posterior.scale_tril[0]
     independent = torch.equal(root, torch.diag(root.diagonal()))
     return "normal" if independent else "multivariate normal"
 
 
-def _sampled(fit: Fit, target: Any, argument: Any, best: Optimum) -> dict[str, Tensor]:
+def _sampled(fit: Fitted, target: Any, argument: Any, best: Optimum) -> dict[str, Tensor]:
     chains = int(fit.diagnostics["chains"])
     found = sample_posterior(
         target,

@@ -6,8 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -20,24 +19,24 @@ from torch import Tensor
 from pyro_dynogp.data.channels import from_plain, to_plain
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.scaling import Scaling
-from pyro_dynogp.inference.density import Potential
-from pyro_dynogp.inference.posteriors import GaussianGuide, MixtureGuide
+from pyro_dynogp.inference.density import Potential, Site
+from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.posteriors import Mixture, Posterior, Sampled
 from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.wiring import Dynamic, Layer, Static
 from pyro_dynogp.support.errors import invalid
-
-if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+from pyro_dynogp.support.frozen import FrozenMapping
 
 FORMAT = "pyro_dynogp.fit"
-VERSION = 4
+# Version 5 writes, 4 and 5 are read.
+VERSION, OLDEST = 5, 4
 # The models that a file may name: a file never decides what code is run.
 MODELS = ("Model", "Cascade", "LinearDynamicGP")
 LAYERS: dict[str, type[Dynamic] | type[Static]] = {"Dynamic": Dynamic, "Static": Static}
 
 
-def save(fit: Fit, path: str | Path) -> None:
+def save(fit: Fitted, path: str | Path) -> None:
     """Write a fit to a file; `load` restores every number to the last bit.
 
     Raises:
@@ -48,21 +47,20 @@ def save(fit: Fit, path: str | Path) -> None:
     tensors |= {f"mode/{name}": value.contiguous() for name, value in fit.mode.items()}
     tensors["history"] = torch.as_tensor(np.ascontiguousarray(fit.history))
     tensors["start_energies"] = torch.as_tensor(np.ascontiguousarray(fit.start_energies))
-    points: Mapping[str, Tensor] = {}
-    if fit.posterior is not None:
-        tensors["posterior/loc"] = fit.posterior.loc
-        tensors["posterior/scale_tril"] = fit.posterior.scale_tril
-    if isinstance(fit.posterior, MixtureGuide):
-        points = fit.posterior.points
-        tensors["posterior/weights"] = fit.posterior.weights
-        tensors |= {f"point/{name}": value for name, value in points.items()}
+    posterior, points = fit.posterior, list[str]()
+    if isinstance(posterior, Mixture) and posterior.sites:
+        points = list(posterior.points)
+        tensors["posterior/weights"] = posterior.weights
+        tensors["posterior/loc"] = posterior.loc
+        tensors["posterior/scale_tril"] = posterior.scale_tril
+        tensors |= {f"point/{name}": value for name, value in posterior.points.items()}
     for index, record in enumerate(fit.records):
         tensors |= _arrays(record, f"record/{index}")
     tensors |= {f"log_q/{name}": value for name, value in fit.log_q_sites.items()}
     header = {
         "format": FORMAT,
         "version": VERSION,
-        "model": type(fit.model).__name__,
+        "model": "Model",
         "options": options,
         "scaling": fit.scaling.to_dict(),
         "method": fit.method,
@@ -71,7 +69,7 @@ def save(fit: Fit, path: str | Path) -> None:
         "log_q": list(fit.log_q_sites),
         "diagnostics": dict(fit.diagnostics),
         "sites": list(fit.draws),
-        "points": list(points),
+        "points": points,
     }
     folder = Path(path).resolve().parent
     if not folder.is_dir():
@@ -82,15 +80,13 @@ def save(fit: Fit, path: str | Path) -> None:
     save_file(clones, str(path), metadata={FORMAT: json.dumps(header)})
 
 
-def load(path: str | Path) -> Fit:
+def load(path: str | Path) -> Fitted:
     """Read a fit that `Fit.save` wrote.
 
     Raises:
         ValueError: where the file is missing, damaged, not a pyro_dynogp fit, or of a version
             that this package does not know.
     """
-    from pyro_dynogp.inference.fitted import Fit
-
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"load: there is no file {path}.")
@@ -114,13 +110,14 @@ def load(path: str | Path) -> Fit:
         version = header["version"]
     except (json.JSONDecodeError, KeyError, TypeError) as error:
         raise ValueError(f"load: the header of {path} is damaged ({error}).") from error
-    if version != VERSION:
+    if not isinstance(version, int) or not OLDEST <= version <= VERSION:
         raise ValueError(
-            f"load: {path} has format version {version}, this package reads version {VERSION}. "
+            f"load: {path} has format version {version}, this package reads versions {OLDEST} "
+            f"to {VERSION}. "
             "Use the version of pyro_dynogp that wrote it, or fit again."
         )
     try:
-        return _restore(Fit, header, tensors)
+        return _restore(header, tensors)
     except (KeyError, TypeError) as error:
         raise ValueError(f"load: {path} is incomplete or damaged ({error}).") from error
 
@@ -171,37 +168,47 @@ def _layer(options: Mapping[str, Any]) -> Layer:
     return LAYERS[kind](**given)
 
 
-def _restore(kind: type[Fit], header: dict[str, Any], tensors: dict[str, Any]) -> Fit:
+def _restore(header: dict[str, Any], tensors: dict[str, Any]) -> Fitted:
     name = header["model"]
     if name not in MODELS:
         raise ValueError(f"load: unknown model {name!r}; known are {sorted(MODELS)}.")
     scaling = Scaling.from_dict(header["scaling"])
     model = _model(name, header["options"], scaling)
-    draws = {site: tensors[f"draws/{site}"] for site in header["sites"]}
-    mode = {site: tensors[f"mode/{site}"] for site in header["sites"]}
-    points = {site: tensors[f"point/{site}"] for site in header["points"]}
-    posterior: GaussianGuide | MixtureGuide | None = None
+    renamed: dict[str, str] = {}
+    if header["version"] == 4 and name == "LinearDynamicGP":
+        renamed = {site: f"g_{site}" for site in header["sites"] if site[:13] == "initial_state"}
+    draws, mode, points, log_q = (
+        FrozenMapping({renamed.get(site, site): tensors[f"{kind}/{site}"] for site in sites})
+        for kind, sites in (
+            ("draws", header["sites"]), ("mode", header["sites"]),
+            ("point", header["points"]), ("log_q", header["log_q"]),
+        )
+    )  # fmt: skip
+    posterior: Posterior
     if "posterior/loc" in tensors:
+        loc, root = tensors["posterior/loc"], tensors["posterior/scale_tril"]
+        weights = tensors.get("posterior/weights", torch.ones(1, dtype=torch.float64))
+        if loc.dim() == 1:  # version 4 has one normal without weights so
+            loc, root = loc[None], root[None]
         sites = _sites(model, scaling, mode, points, len(header["records"]))
-        normal = tensors["posterior/loc"], tensors["posterior/scale_tril"], sites
-        posterior = GaussianGuide(*normal)
-        if "posterior/weights" in tensors:
-            posterior = MixtureGuide(tensors["posterior/weights"], points, *normal)
-    return kind(
+        posterior = Mixture(weights, points, loc, root, sites)
+    elif header["method"] == "map":
+        posterior = Mixture.at(mode)
+    else:
+        posterior = Sampled(draws, header["method"], log_q_sites=log_q)
+    return Fitted(
         model=model,
-        method=header["method"],
-        draws=MappingProxyType(draws),
-        mode=MappingProxyType(mode),
+        posterior=posterior,
+        draws=draws,
+        mode=mode,
         history=tensors["history"].numpy(),
         start_energies=tensors["start_energies"].numpy(),
-        diagnostics=MappingProxyType(header["diagnostics"]),
+        diagnostics=FrozenMapping(header["diagnostics"]),
         seed=header["seed"],
         records=tuple(
             _record(labels, tensors, f"record/{index}")
             for index, labels in enumerate(header["records"])
         ),
-        posterior=posterior,
-        log_q_sites=MappingProxyType({name: tensors[f"log_q/{name}"] for name in header["log_q"]}),
     )
 
 
@@ -243,7 +250,7 @@ def _sites(
     mode: Mapping[str, Tensor],
     points: Mapping[str, Tensor],
     records: int,
-) -> tuple[Any, ...]:
+) -> tuple[Site, ...]:
     """The sites of the normal posterior in their order, without the training records."""
 
     def parameters() -> None:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
+from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.models.wiring import Dynamic
 
-if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
 
-
-def summary(fit: Fit) -> str:
+def summary(fit: Fitted) -> str:
     """What was fitted, how well it went, the modes at the best optimum."""
     system = fit.system_at(fit.mode)
     model = fit.model

@@ -14,7 +14,7 @@ from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
     from pyro_dynogp.data.record import Record
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.fitting import Fit
 
 
 def residuals(fit: Fit, record: Record) -> Figure:

@@ -15,7 +15,7 @@ from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.tensors import Numbers
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.fitting import Fit
 
 DAMPING_LINES = (0.05, 0.1, 0.2, 0.4, 0.7)
 

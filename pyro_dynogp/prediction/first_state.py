@@ -14,18 +14,18 @@ from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.system import System
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.inference.fitted import Fitted
 
 # Samples from which a first state is estimated: it is forgotten soon after.
 SAMPLES = 400
 
 
-def unknown_beginning(fit: Fit) -> System:
+def unknown_beginning(fit: Fitted) -> System:
     """The fitted system after past inputs of which nothing is known."""
     return fit.model.begin(fit.system, {})
 
 
-def beginning(fit: Fit, record: Record, *, predicting: bool = False) -> System:
+def beginning(fit: Fitted, record: Record, *, predicting: bool = False) -> System:
     """The fitted system at the beginning of a record.
 
     On a training record the first state is that of the posterior draws. On another record that of
@@ -51,7 +51,7 @@ def beginning(fit: Fit, record: Record, *, predicting: bool = False) -> System:
     return model.begin(fit.system, states)
 
 
-def training_index(fit: Fit, record: Record) -> int | None:
+def training_index(fit: Fitted, record: Record) -> int | None:
     """Index of a record among the training records, as measured or as the model sees them."""
     for index, known in enumerate(fit.records):
         if record.fingerprint in (known.fingerprint, fit.model.check(known)[0].fingerprint):
@@ -59,7 +59,7 @@ def training_index(fit: Fit, record: Record) -> int | None:
     return None
 
 
-def estimate(fit: Fit, record: Record) -> dict[str, Tensor]:
+def estimate(fit: Fitted, record: Record) -> dict[str, Tensor]:
     """Most probable first state of a record, as standard normal numbers (2P,) by layer.
 
     Of layers that a static layer sees.

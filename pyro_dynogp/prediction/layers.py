@@ -17,7 +17,7 @@ from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.tensors import as_tensor
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.inference.fitted import Fitted
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class LayerTrajectory:
     draw_sd: np.ndarray
 
 
-def layers(fit: Fit, record: Record) -> dict[str, LayerTrajectory]:
+def layers(fit: Fitted, record: Record) -> dict[str, LayerTrajectory]:
     """Smoothed trajectories of all layers given a record's inputs and outputs."""
     record = one_record(fit, record)
     with torch.no_grad():
@@ -72,7 +72,9 @@ class StaticBand:
     inputs: np.ndarray
 
 
-def static_function(fit: Fit, name: str, record: Record, channel: int, points: int) -> StaticBand:
+def static_function(
+    fit: Fitted, name: str, record: Record, channel: int, points: int
+) -> StaticBand:
     """See `Fit.static_function`."""
     wires = {wire.name: wire for wire in fit.model.wires}
     layer = fit.system.layer(name)

@@ -19,13 +19,15 @@ from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.parallel import seeded
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.inference.fitted import Fitted
 
 # In the kind of a k-step prediction whose joint samples depend on each other as its errors do.
 JOINT = ", errors drawn jointly"
 
 
-def simulate(fit: Fit, record: Record, process_noise: bool, samples: int, seed: int) -> Prediction:
+def simulate(
+    fit: Fitted, record: Record, process_noise: bool = True, samples: int = 200, seed: int = 0
+) -> Prediction:
     """See `Fit.simulate`."""
     record = one_record(fit, record)
     with torch.no_grad():
@@ -36,7 +38,12 @@ def simulate(fit: Fit, record: Record, process_noise: bool, samples: int, seed: 
 
 
 def forecast(
-    fit: Fit, past: Record, future: Record, process_noise: bool, samples: int, seed: int
+    fit: Fitted,
+    past: Record,
+    future: Record,
+    process_noise: bool = True,
+    samples: int = 200,
+    seed: int = 0,
 ) -> Prediction:
     """See `Fit.forecast`."""
     past, future = following(fit, past, future)
@@ -58,7 +65,7 @@ def forecast(
 
 
 def _forward(
-    fit: Fit, record: Record, outputs: OutputProcess, samples: int, seed: int, kind: str
+    fit: Fitted, record: Record, outputs: OutputProcess, samples: int, seed: int, kind: str
 ) -> Prediction:
     """Outputs from a first state and the inputs."""
     found = outputs.components(samples=samples, seed=seed, several_channels=not fit.collapsed)
@@ -69,7 +76,9 @@ def _forward(
     )  # fmt: skip
 
 
-def predict(fit: Fit, record: Record, horizon: int, samples: int, seed: int) -> Prediction:
+def predict(
+    fit: Fitted, record: Record, horizon: int = 1, samples: int = 200, seed: int = 0
+) -> Prediction:
     """See `Fit.predict`."""
     record = one_record(fit, record)
     if not isinstance(horizon, int | np.integer) or horizon < 1:

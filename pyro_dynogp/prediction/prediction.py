@@ -13,10 +13,26 @@ import pandas as pd
 from scipy.special import log_ndtr, logsumexp, ndtr, ndtri, ndtri_exp
 
 from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.frozen import FrozenMapping
 
 # A quantile is found to this share of the smallest standard deviation of a component; steps for it.
 RESOLUTION, ITERATIONS = 1e-10, 100
 ROOT_TWO_PI = math.sqrt(2.0 * math.pi)
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """A sampler of a prediction whose joint samples are drawn already.
+
+    Attributes:
+        samples: (S', n, n_y).
+    """
+
+    samples: np.ndarray
+
+    def __call__(self) -> np.ndarray:
+        """The samples."""
+        return self.samples
 
 
 class Parts(Mapping[str, np.ndarray]):
@@ -75,6 +91,11 @@ class Prediction:
     sampler: Callable[[], np.ndarray]
     kind: str
     weights: np.ndarray | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """With joint samples drawn and shares computed: any callable may have been behind them."""
+        samples, parts = self.samples, FrozenMapping(self.parts)
+        return {**self.__dict__, "sampler": Drawn(samples), "parts": parts}
 
     @property
     def component_weights(self) -> np.ndarray:

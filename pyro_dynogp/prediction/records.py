@@ -11,10 +11,10 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.inference.fitted import Fitted
 
 
-def one_record(fit: Fit, record: Record) -> Record:
+def one_record(fit: Fitted, record: Record) -> Record:
     """A record prepared with the channels of the model.
 
     Raises:
@@ -30,7 +30,7 @@ def one_record(fit: Fit, record: Record) -> Record:
     return fit.model.check(record)[0]
 
 
-def following(fit: Fit, past: Record, future: Record) -> tuple[Record, Record]:
+def following(fit: Fitted, past: Record, future: Record) -> tuple[Record, Record]:
     """Two records prepared together: a channel may reach back into the first, or ahead.
 
     Inputs of the future are given; a clock that is late takes those of the past from there.

@@ -17,7 +17,7 @@ from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
     from pyro_dynogp.data.record import Record
-    from pyro_dynogp.discrepancy.report import FoundEffect, Report
+    from pyro_dynogp.discrepancy.result import FoundEffect, LoopResult
     from pyro_dynogp.prediction.prediction import Prediction
     from pyro_dynogp.statistics.evidence import Evidence
 
@@ -68,7 +68,7 @@ def evidence(effect: FoundEffect | Evidence) -> Figure:
     return figure
 
 
-def before_after(report: Report, part: slice | None = None) -> Figure:
+def before_after(report: LoopResult, part: slice | None = None) -> Figure:
     """Forecasts of the sealed block by the model given and by the extended one.
 
     Predictive mean with 50 and 95 % bands for measured outputs, and what was measured; one scale
@@ -108,7 +108,7 @@ def before_after(report: Report, part: slice | None = None) -> Figure:
     return _finished(figure, axes, clock, f"Forecast of {which}")
 
 
-def residuals_before_after(report: Report) -> Figure:
+def residuals_before_after(report: LoopResult) -> Figure:
     """What the forecasts of the sealed block leave of the measured outputs, on one scale.
 
     Args:
@@ -142,7 +142,7 @@ def residuals_before_after(report: Report) -> Figure:
     return _finished(figure, axes, clock, "Residuals of the forecast of the sealed data")
 
 
-def _forecasts(report: Report) -> list[tuple[str, Prediction]]:
+def _forecasts(report: LoopResult) -> list[tuple[str, Prediction]]:
     """Forecasts to draw, each with a word; one where nothing was added."""
     before, after = report.forecast_before, report.forecast_after
     for name, made in (("forecast_before", before), ("forecast_after", after)):
@@ -157,7 +157,7 @@ def _forecasts(report: Report) -> list[tuple[str, Prediction]]:
 
 
 def _panels(
-    report: Report, forecasts: Sequence[object]
+    report: LoopResult, forecasts: Sequence[object]
 ) -> tuple[Figure, np.ndarray, style.TimeAxis]:
     """One panel for each output and forecast; those of one output share their scale."""
     count = report.sealed.n_outputs * len(forecasts)

@@ -18,7 +18,7 @@ from tqdm import tqdm
 import pyro_dynogp as dgp
 from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.left_out import monte_carlo_error
-from pyro_dynogp.criticism.posterior_draws import draws_of, with_draws
+from pyro_dynogp.criticism.posterior_draws import draws_of
 from pyro_dynogp.criticism.subjects import FitSubject, observed_of
 from pyro_dynogp.inference.methods.optima import posterior_of
 from pyro_dynogp.inference.optimise.maximum import Optimum
@@ -137,7 +137,7 @@ def conditional(fit: Any, record: dgp.Record) -> np.ndarray:
     Sample i is given the noise-free output at i, drawn from its posterior, which has seen y_i.
     """
     values = draws_of(fit, count=2000, seed=3).values
-    some = with_draws(fit, values)
+    some = fit.with_draws(values)
     y = record.tensors().observations
     observed = observed_of(some, record, 0)
     with pyro.validation_enabled(False), torch.no_grad():

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 
 import torch
 
@@ -29,7 +28,7 @@ def run(folder: Path) -> str:
     rows = []
     for n in SIZES:
         fit = replace(start, records=(record[:n],))
-        several = replace(fit, method="nuts", draws=MappingProxyType(draws))
+        several = fit.with_draws(draws)
         cells = []
         for one, options in ((fit, {"parameters": "mode"}), (several, {})):
             for target in ("missing sample", "forecast"):

@@ -10,7 +10,7 @@ import torch
 import pyro_dynogp as dgp
 from pyro_dynogp.criticism.arviz_bridge import good_k
 from pyro_dynogp.criticism.finding import Finding, apart
-from pyro_dynogp.inference.posteriors import GaussianGuide
+from pyro_dynogp.inference.posteriors import Sampled
 from tests.conftest import simulate_record
 
 QUIET = {"workers": 1, "progress": False}
@@ -40,7 +40,7 @@ def test_a_good_fit(good):
 
 def test_an_overconfident_posterior(good):
     guide = good.posterior
-    narrow = GaussianGuide(guide.loc, 0.3 * guide.scale_tril, guide.sites)
+    narrow = replace(guide, scale_tril=0.3 * guide.scale_tril)
     found = dgp.check(replace(good, posterior=narrow))
     assert found["posterior k"].good is False
     assert found["posterior k"].value > 0.7
@@ -96,7 +96,7 @@ def test_chains(good):
     diagnostics = {"divergences": 0.0, "chains": 2.0}
     diagnostics |= {f"r_hat {name}": 1.002 for name in names}
     diagnostics |= {f"effective samples {name}": 900.0 for name in names}
-    chains = replace(good, method="nuts", posterior=None, diagnostics=MappingProxyType(diagnostics))
+    chains = replace(good, posterior=Sampled(good.draws), diagnostics=MappingProxyType(diagnostics))
     found = dgp.check(chains)
     assert found["R-hat"].good
     assert found["effective draws"].good

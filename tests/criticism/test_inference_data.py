@@ -285,7 +285,7 @@ class TestCascades:
 
     def test_ratios_of_each_optimum_by_themselves(self, collapsed):
         draws = exported_draws(collapsed)
-        optimum = collapsed.posterior.optimum(collapsed.draws).numpy()
+        optimum = collapsed.posterior.component(collapsed.draws).numpy()
         np.testing.assert_array_equal(draws.group, optimum)
 
     def test_trajectories_as_sites(self):

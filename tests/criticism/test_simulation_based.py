@@ -10,7 +10,8 @@ import pyro_dynogp as dgp
 from pyro_dynogp.criticism import simulation_based
 from pyro_dynogp.criticism.posterior_draws import PosteriorDraws
 from pyro_dynogp.criticism.simulation_based import _Fixed, _simulated, _Task
-from pyro_dynogp.inference.fitted import Fit
+from pyro_dynogp.fitting import Fit
+from pyro_dynogp.inference.posteriors import Sampled
 
 QUIET = {"workers": 1, "progress": False}
 
@@ -91,7 +92,7 @@ def test_an_overconfident_posterior_is_rejected(model, blank, monkeypatch, width
     """Without a fit: draws from the prior are the posterior given data that say nothing."""
 
     def nothing(task, record):
-        return Fit(task.model, "map", {}, {}, np.zeros(1), np.zeros(1), {}, 0, ())
+        return Fit(task.model, Sampled({}), {}, {}, np.zeros(1), np.zeros(1), {}, 0, ())
 
     def draws_of(fit, *, count, seed, anneal):
         generator = torch.Generator().manual_seed(seed)

@@ -13,7 +13,7 @@ from pyro_dynogp.criticism.posterior_draws import log_joint_of
 from pyro_dynogp.criticism.twin import Effort, Gap, _judged, _rms, _sites, twin_findings
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.methods.nuts import Chains
-from pyro_dynogp.inference.posteriors import GaussianGuide, gaussian_guide
+from pyro_dynogp.inference.posteriors import Mixture, Sampled
 from pyro_dynogp.inference.refit import refit
 from tests.conftest import simulate_record
 
@@ -26,10 +26,10 @@ def exact(model, argument, values, *, chains, draws, **options):
     del options
     potential = Potential(model, (argument,), values)
     centre, root = potential.laplace(values, widest=1.5)
-    guide = gaussian_guide(potential, torch.as_tensor(centre), torch.as_tensor(root))
+    guide = Mixture.normal(potential, torch.as_tensor(centre), torch.as_tensor(root))
     generator = torch.Generator().manual_seed(0)
     z = torch.randn(4000, len(centre), generator=generator, dtype=torch.float64)
-    found = guide.values_at(guide.loc + z @ guide.scale_tril.mT)
+    found = guide.at_latent(guide.loc[0] + z @ guide.scale_tril[0].mT)
     ratio = log_joint_of(model, (argument,), found) - guide.log_prob(found).numpy()
     weights = np.exp(arviz_bridge.psis(ratio)[0])
     chosen = np.random.default_rng(0).choice(4000, chains * draws, p=weights / weights.sum())
@@ -83,7 +83,7 @@ def test_a_good_fit_is_near_nuts(fit, chains):
 
 def test_an_overconfident_posterior_is_called_too_narrow(fit, small, chains, monkeypatch):
     guide = small.posterior
-    shrunk = GaussianGuide(guide.loc, 0.3 * guide.scale_tril, guide.sites)
+    shrunk = replace(guide, scale_tril=0.3 * guide.scale_tril)
     narrow = replace(small, posterior=shrunk)
     monkeypatch.setattr(twin, "refit", lambda fit, records: narrow)
     found = dgp.check(fit, twin=40, **QUIET)
@@ -161,9 +161,13 @@ def test_words_and_limits():
 
 def test_what_is_refused(fit):
     with pytest.raises(ValueError, match="twin: expected False for a fit with trajectories as"):
-        dgp.check(replace(fit, log_q_sites={"g": torch.zeros(3)}), twin=40, **QUIET)
+        dgp.check(
+            replace(fit, posterior=Sampled(fit.draws, "svi", log_q_sites={"g": torch.zeros(3)})),
+            twin=40,
+            **QUIET,
+        )
     with pytest.raises(ValueError, match="twin: expected False for a fit by NUTS"):
-        dgp.check(replace(fit, method="nuts", posterior=None), twin=40, **QUIET)
+        dgp.check(replace(fit, posterior=Sampled(fit.draws)), twin=40, **QUIET)
     for wrong in (True, 5, 61, 30.0):
         with pytest.raises(ValueError, match="twin: expected False, or a number of samples from 2"):
             dgp.check(fit, twin=wrong, **QUIET)

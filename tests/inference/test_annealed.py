@@ -12,7 +12,7 @@ import pyro_dynogp as dgp
 from pyro_dynogp.criticism.left_out import spread_of
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.methods.annealed import Joint, Student, anneal, around
-from pyro_dynogp.inference.posteriors import gaussian_guide
+from pyro_dynogp.inference.posteriors import Mixture
 
 
 def tensor(x):
@@ -107,16 +107,17 @@ def test_a_target_that_no_particle_can_reach():
 
 
 def test_student_start():
-    guide = type("G", (), {"loc": tensor([1.0, -2.0]), "scale_tril": tensor([[1.0, 0], [0.5, 2]])})
-    z, student = around(guide, 4000, seed=1)
+    loc, root = tensor([1.0, -2.0]), tensor([[1.0, 0], [0.5, 2]])
+    normal = type("G", (), {"loc": loc[None], "scale_tril": root[None]})
+    z, student = around(normal, 4000, seed=1)
     value, gradient = student(z)
-    exact = dist.MultivariateStudentT(tensor(5.0), guide.loc, guide.scale_tril).log_prob(z)
+    exact = dist.MultivariateStudentT(tensor(5.0), loc, root).log_prob(z)
     torch.testing.assert_close(value, exact)
     x = z[:5].clone().requires_grad_()
-    (slope,) = torch.autograd.grad(Student(guide.loc, guide.scale_tril).distribution
+    (slope,) = torch.autograd.grad(Student(loc, root).distribution
                                    .log_prob(x).sum(), x)  # fmt: skip
     torch.testing.assert_close(gradient[:5], slope)
-    inside = torch.linalg.solve_triangular(guide.scale_tril, (z - guide.loc).mT, upper=False)
+    inside = torch.linalg.solve_triangular(root, (z - loc).mT, upper=False)
     # Squared radii over d are F(2, 5), whose median is 0.799.
     assert float((inside.square().sum(0) / 2).median()) == pytest.approx(0.799, abs=0.06)
 
@@ -133,7 +134,7 @@ def test_posterior_of_a_conjugate_model():
 
     potential = Potential(model, (), {"tau": tensor(1.0), "mu": tensor(0.5)})
     loc = tensor([math.log(1.2), 0.8])
-    guide = gaussian_guide(potential, loc, 0.6 * torch.eye(2, dtype=torch.float64))
+    guide = Mixture.normal(potential, loc, 0.6 * torch.eye(2, dtype=torch.float64))
     z, start = around(guide, 1500, 0)
     found = anneal(z, start, Joint(model, (), potential.sites))
     values = potential.unpack(found.z)

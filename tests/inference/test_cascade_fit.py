@@ -13,7 +13,7 @@ from pyro.infer.autoguide import AutoNormal
 import pyro_dynogp as dgp
 from pyro_dynogp.guides.families import Point
 from pyro_dynogp.inference.methods.trajectories import layer_guide
-from pyro_dynogp.inference.posteriors import GaussianGuide, MixtureGuide
+from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.starts.plans import Plan, linear_twin, starting_point
 from pyro_dynogp.inference.starts.poles import starting_values
 from tests.inference.cascades import FAST, same, wiener, wiener_record
@@ -25,6 +25,14 @@ ARCHITECTURES = {
     "wiener-hammerstein": dgp.WienerHammerstein(1, **SMALL),
     "hammerstein-wiener": dgp.HammersteinWiener(1, **SMALL),
 }
+
+
+def options_for(guide, **changes):
+    """Of a fast fit: the mode without a guide, else SVI with trajectories as sites."""
+    options = {**FAST, **changes}
+    if guide is not None:
+        return {**options, "guide": guide}
+    return {k: v for k, v in options.items() if k not in ("particles", "draws")} | {"method": "map"}
 
 
 def usable(fit, record):
@@ -41,9 +49,7 @@ def usable(fit, record):
 @pytest.mark.parametrize("name", list(ARCHITECTURES))
 @pytest.mark.parametrize("guide", [None, "gauss-markov", "inducing times"])
 def test_every_architecture_with_every_guide(name, guide, bent):
-    method = "map" if guide is None else None
-    fit = dgp.fit(ARCHITECTURES[name], bent[:60], guide=guide, method=method,
-                  **{**FAST, "steps": 2})  # fmt: skip
+    fit = dgp.fit(ARCHITECTURES[name], bent[:60], **options_for(guide, steps=2))
     assert usable(fit, bent[:60])
     assert fit.method == ("map" if guide is None else "svi")
     dynamic = [one.name for one in fit.model.wires if isinstance(one.layer, dgp.Dynamic)]
@@ -62,11 +68,11 @@ def test_hyperparameters(hyperparameters, bent):
     still = {name for name, sd in spread.items() if sd == 0.0}
     if hyperparameters == "map":
         assert set(fit.draws) - still == {"f_values", "g_initial_state"}
-        assert isinstance(fit.posterior, MixtureGuide)
+        assert isinstance(fit.posterior, Mixture)
         assert set(fit.posterior.points) == still
     else:
         assert not still
-        assert isinstance(fit.posterior, GaussianGuide)
+        assert not fit.posterior.points
     assert set(fit.guide(bent)) == set(fit.draws)
 
 
@@ -75,7 +81,7 @@ def test_one_dynamic_layer_is_the_linear_model(record):
     train = record[:60]
     model = dgp.Cascade(1, (dgp.Dynamic(pairs=1),), priors="paper")
     cascade = dgp.fit(model, train, method="svi", **FAST)
-    assert isinstance(cascade.posterior, GaussianGuide)
+    assert not cascade.posterior.points
     assert all(bool((v[0] != v[-1]).any()) for v in cascade.draws.values())
     # Flat priors: by default gains of a layer, which has unit scale, have a narrower one.
     linear = dgp.LinearDynamicGP(inputs=1, pairs=1, priors="paper").scaled_to(train)
@@ -143,8 +149,7 @@ class TestRecords:
         y = records[0].outputs.copy()
         y[[3, 4, 20]] = np.nan
         records[0] = records[0].with_outputs(y)
-        method = "map" if guide is None else "svi"
-        fit = dgp.fit(wiener(), records, guide=guide, method=method, **FAST)
+        fit = dgp.fit(wiener(), records, **options_for(guide))
         assert len(fit.training) == 2
         assert fit.draws["g_initial_state_1"].shape[-1] == 2
         if guide is not None:
@@ -156,18 +161,15 @@ class TestRecords:
     @pytest.mark.parametrize("guide", [None, "gauss-markov"])
     def test_two_outputs(self, guide, two_outputs):
         model = dgp.Wiener(2, outputs=2, pairs=1, inducing=5)
-        method = "map" if guide is None else "svi"
         train = two_outputs[:40]
-        fit = dgp.fit(model, train, guide=guide, method=method, **{**FAST, "steps": 2})
+        fit = dgp.fit(model, train, **options_for(guide, steps=2))
         assert usable(fit, train)
         assert fit.predict(train).mean.shape == (40, 2)
 
     @pytest.mark.parametrize("guide", [None, "gauss-markov"])
     @pytest.mark.parametrize("likelihood", [dgp.StudentT(4.0), dgp.Heteroscedastic(4)])
     def test_other_noise(self, guide, likelihood, bent):
-        method = "map" if guide is None else "svi"
-        fit = dgp.fit(wiener(likelihood=likelihood), bent[:40], guide=guide, method=method,
-                      **{**FAST, "steps": 2})  # fmt: skip
+        fit = dgp.fit(wiener(likelihood=likelihood), bent[:40], **options_for(guide, steps=2))
         assert usable(fit, bent[:40])
 
 

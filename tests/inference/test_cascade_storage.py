@@ -13,9 +13,9 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 import pyro_dynogp as dgp
+from pyro_dynogp.fitting import Fit
 from pyro_dynogp.inference.density import Potential
-from pyro_dynogp.inference.fitted import Fit
-from pyro_dynogp.inference.posteriors import MixtureGuide, gaussian_guide
+from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.storage import FORMAT
 from tests.inference.cascades import FAST, wiener_record
 
@@ -35,7 +35,7 @@ def prior_fit(model, *records):
     }
     return Fit(
         model=model,
-        method="map",
+        posterior=Mixture.at(values),
         draws=MappingProxyType({k: v.unsqueeze(0) for k, v in values.items()}),
         mode=MappingProxyType(values),
         history=np.array([2.0, 1.0]),
@@ -94,7 +94,7 @@ def test_exact_round_trip(name, request, tmp_path, bent):
 
 def test_loaded_guide_is_the_same_distribution(collapsed_fit, tmp_path, bent):
     """The posterior is a normal for some sites and a point for the others: all are restored."""
-    assert isinstance(collapsed_fit.posterior, MixtureGuide)
+    assert isinstance(collapsed_fit.posterior, Mixture)
     collapsed_fit.save(tmp_path / "fit")
     again = dgp.load(tmp_path / "fit")
     totals = []
@@ -180,10 +180,9 @@ def test_a_linear_guide_with_a_first_state(tmp_path, map_fit, record):
     fit = replace(
         map_fit,
         model=model,
-        method="svi",
         mode=values,
         draws={name: value.unsqueeze(0) for name, value in values.items()},
-        posterior=gaussian_guide(potential, potential.pack(values), root),
+        posterior=Mixture.normal(potential, potential.pack(values), root),
     )
     fit.save(tmp_path / "fit")
     again = dgp.load(tmp_path / "fit")

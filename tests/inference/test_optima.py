@@ -12,8 +12,8 @@ import pyro_dynogp as dgp
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.methods.optima import LEAST_WEIGHT, MOST_OPTIMA, _weighted, spread
 from pyro_dynogp.inference.optimise.maximum import Optimum
-from pyro_dynogp.inference.posteriors import GaussianGuide, MixtureGuide
-from pyro_dynogp.support.checkpoints import NOTHING_KEPT
+from pyro_dynogp.inference.posteriors import Mixture
+from pyro_dynogp.inference.run import Run
 from tests.inference.cascades import FAST, wiener
 
 
@@ -25,7 +25,7 @@ def several(bent):
 
 def test_consists_of_distinct_optima_by_weight(several):
     posterior = several.posterior
-    assert isinstance(posterior, MixtureGuide)
+    assert isinstance(posterior, Mixture)
     K = len(posterior.weights)
     assert 2 <= K <= MOST_OPTIMA
     assert several.diagnostics["optima"] == K
@@ -53,12 +53,12 @@ def test_a_needle_does_not_lead_because_it_is_high():
         optima.append(Optimum(energy, values, np.zeros(1), ""))
     optima.sort(key=lambda one: one.energy)
     assert float(optima[0].values["x"]) == -2.0  # the needle is the highest
-    leading, weights = _weighted(hills, None, optima, 1, NOTHING_KEPT, False)
+    leading, weights = _weighted(hills, None, optima, Run(workers=1))
     tempered = (shares ** (1.0 / spread(optima[0].values))).sort(descending=True).values
     kept = tempered[tempered / tempered.sum() >= LEAST_WEIGHT]
     assert [float(values["x"]) for values in leading] == [0.0, 2.0]
     assert weights.numpy() == pytest.approx((kept / kept.sum()).numpy(), abs=0.01)
-    alone, one = _weighted(hills, None, optima[:1], 1, NOTHING_KEPT, False)
+    alone, one = _weighted(hills, None, optima[:1], Run(workers=1))
     assert (len(alone), one.tolist()) == (1, [1.0])
 
 
@@ -98,12 +98,13 @@ def test_density_of_a_draw_is_the_component_s(several):
         torch.manual_seed(1)
         trace = pyro.poutine.trace(posterior).get_trace()
     k = trace.nodes["_optimum"]["value"]
-    normal = GaussianGuide(posterior.loc[k], posterior.scale_tril[k], posterior.sites)
     with torch.random.fork_rng():
         torch.manual_seed(1)
         z = trace.nodes["_latent"]["value"]
     expected = (
-        torch.distributions.MultivariateNormal(normal.loc, scale_tril=normal.scale_tril).log_prob(z)
+        torch.distributions.MultivariateNormal(
+            posterior.loc[k], scale_tril=posterior.scale_tril[k]
+        ).log_prob(z)
         + posterior.weights[k].log()
     )
     assert float(trace.log_prob_sum()) == pytest.approx(float(expected))
@@ -139,7 +140,7 @@ def test_log_prob_of_draws_is_that_of_the_trace(several):
     draws, expected = total(several.posterior)
     torch.testing.assert_close(several.posterior.log_prob(draws), expected, rtol=1e-10, atol=1e-8)
     with pytest.raises(ValueError, match="none of its optima"):
-        several.posterior.optimum({**draws, "g_log_decay": draws["g_log_decay"] + 1.0})
+        several.posterior.component({**draws, "g_log_decay": draws["g_log_decay"] + 1.0})
 
 
 def test_log_prob_of_a_single_normal(svi_fit):

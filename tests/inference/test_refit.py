@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import pyro_dynogp as dgp
-from pyro_dynogp.inference.posteriors import MixtureGuide
+from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.refit import optima_of, refit
 from tests.inference.cascades import FAST, wiener
 
@@ -39,14 +39,14 @@ def test_svi_keeps_its_family(svi_fit, record):
 
 def test_a_cascade_keeps_its_optima(bent):
     fit = dgp.fit(wiener(), bent, **{**FAST, "restarts": 3, "steps": 20, "draws": 20})
-    assert isinstance(fit.posterior, MixtureGuide)
+    assert isinstance(fit.posterior, Mixture)
     optima = optima_of(fit)
     assert len(optima) == len(fit.posterior.weights)
     torch.testing.assert_close(optima[0]["g_log_decay"], fit.mode["g_log_decay"])
     y = bent.outputs.copy()
     y[30:40] = np.nan
     again = refit(fit, bent.with_outputs(y))
-    assert isinstance(again.posterior, MixtureGuide)
+    assert isinstance(again.posterior, Mixture)
     assert len(again.draws["f_values"]) == 20
 
 

@@ -10,7 +10,8 @@ import pyro
 import torch
 
 import pyro_dynogp as dgp
-from pyro_dynogp.inference.fitted import Fit
+from pyro_dynogp.fitting import Fit
+from pyro_dynogp.inference.posteriors import Sampled
 from pyro_dynogp.lti.state import ModalState
 from pyro_dynogp.models.system import scaled_inputs
 
@@ -29,7 +30,7 @@ def fit_of(model, draws, scaling):
     """A fit with the given posterior draws (S, ...) of every site."""
     return Fit(
         model=replace(model, scaling=scaling),
-        method="map" if len(next(iter(draws.values()))) == 1 else "svi",
+        posterior=Sampled(draws, "map" if len(next(iter(draws.values()))) == 1 else "svi"),
         draws=MappingProxyType(dict(draws)),
         mode=MappingProxyType({k: v[0] for k, v in draws.items()}),
         history=np.zeros(1),

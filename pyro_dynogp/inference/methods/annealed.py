@@ -23,7 +23,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from pyro_dynogp.inference.density import Site, each_with_gradient, joint_energy
-from pyro_dynogp.inference.posteriors import GaussianGuide
+from pyro_dynogp.inference.posteriors import Mixture
 
 # Effective share of particles after a step; Hamiltonian moves at each temperature, and at the end.
 EFFECTIVE, MOVES, LAST_MOVES = 0.5, 2, 4
@@ -258,12 +258,13 @@ def _move(
     return there.where(accept, now), rate
 
 
-def around(guide: GaussianGuide, count: int, seed: int) -> tuple[Tensor, Student]:
+def around(normal: Mixture, count: int, seed: int) -> tuple[Tensor, Student]:
     """First particles (S, d) around a normal, and their density."""
-    student = Student(guide.loc, guide.scale_tril)
+    loc, root = normal.loc[0], normal.scale_tril[0]
+    student = Student(loc, root)
     generator = torch.Generator().manual_seed(seed)
-    normal = torch.randn(count, len(guide.loc), generator=generator, dtype=torch.float64)
+    x = torch.randn(count, len(loc), generator=generator, dtype=torch.float64)
     # A chi-squared number by the sum of squares: torch's gamma takes no generator.
     squares = torch.randn(count, int(FREEDOM), generator=generator, dtype=torch.float64)
     spread = (FREEDOM / squares.square().sum(-1, keepdim=True)).sqrt()
-    return guide.loc + spread * (normal @ guide.scale_tril.mT), student
+    return loc + spread * (x @ root.mT), student

@@ -1,13 +1,21 @@
-"""Training of cascades: linear fits first, then all layers together."""
+"""Posterior modes: climbs from several starts, of cascades from linear fits first."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, get_args
+
+import numpy as np
 
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.inference.density import WALL
+from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.optimise.maximum import Optimizer, Optimum, maximise
+from pyro_dynogp.inference.posteriors import Mixture
+from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.plans import (
     Values,
     leading_layers,
@@ -21,9 +29,9 @@ from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.variants import without_noise_below_functions
 from pyro_dynogp.models.wiring import Dynamic
 from pyro_dynogp.support.checkpoints import NOTHING_KEPT, Checkpoints
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import seeded
-
-GuideChoice = str | Mapping[str, Any] | Callable[..., Any] | None
 
 # Starts and iterations of the linear fits that come first.
 LINEAR_STARTS = 6
@@ -89,31 +97,105 @@ def _one_output(records: Sequence[Record]) -> tuple[Record, ...]:
     return tuple(record.select(outputs=[record.output_names[0]]) for record in records)
 
 
+@dataclass(frozen=True)
+class Mode:
+    """The posterior mode: the best optimum of several starts.
+
+    Attributes:
+        optimizer: "lbfgs", "preconditioned" (L-BFGS in coordinates that Hessians make round, which
+            gets to the top of long ridges) or "adam"; None for "adam" where the model has static
+            layers, else "lbfgs". The highest mode may be one that fits the noise.
+
+    Raises:
+        ValueError: on an unknown optimizer.
+    """
+
+    optimizer: Optimizer | None = None
+
+    def __post_init__(self) -> None:
+        check_optimizer(self.optimizer)
+
+    def check(self, model: Model, *, warm: bool) -> None:
+        """Every model has a mode."""
+
+    @property
+    def identity(self) -> object:
+        """All options."""
+        return self
+
+    def __call__(self, problem: Problem, run: Run) -> Fitted:
+        """The mode and how it was found; steps of the run are those of each start."""
+        optima = best_optima(problem, run, self.optimizer, run.steps)
+        return at_optimum(problem.model, optima, run.seed, problem.records)
+
+
+def check_optimizer(optimizer: Optimizer | None) -> None:
+    """Refuse an optimizer that there is not.
+
+    Raises:
+        ValueError: on an unknown name.
+    """
+    if optimizer is not None and optimizer not in get_args(Optimizer):
+        expected = "'lbfgs', 'preconditioned' or 'adam'"
+        raise invalid("optimizer", expected=expected, got=repr(optimizer))
+
+
 def best_optima(
-    model: Model,
-    records: Sequence[Record],
-    restarts: int,
-    steps: int,
-    optimizer: Optimizer,
-    seed: int,
-    workers: int | None,
-    progress: bool,
-    checkpoints: Checkpoints,
-    learnt: Values | None = None,
+    problem: Problem, run: Run, optimizer: Optimizer | None, steps: int | None
 ) -> list[Optimum]:
-    """Optima of the collapsed model from all starts, and from what is learnt, best first."""
-    starts = starting_points(model, records, restarts, steps, seed, workers, progress, checkpoints)
-    return climb(
-        model,
-        records[0] if len(records) == 1 else tuple(records),
-        starts,
-        [] if learnt is None else [grown(learnt, starts[0])],
-        optimizer=optimizer,
-        steps=steps,
+    """Optima of the collapsed model from all starts, and from what is learnt, best first.
+
+    Args:
+        problem: what is fitted. run: how.
+        optimizer: None for what suits the model. steps: most of each start, None for the same.
+
+    Raises:
+        ValueError: where no start leads to a point with a density.
+    """
+    model, records, learnt = problem.model, problem.records, problem.learnt
+    optimizer = optimizer or ("adam" if model.has_function else "lbfgs")
+    restarts = run.restarts or (8 if model.has_function else 6)
+    options: dict[str, Any] = {
+        "optimizer": optimizer, "seed": run.seed, "workers": run.workers,
+        "progress": run.progress, "checkpoints": run.checkpoints,
+    }  # fmt: skip
+    if model.is_linear:
+        starts = starting_values(model, records, count=restarts, seed=run.seed)
+        if learnt is not None:
+            starts = [grown(learnt, starts[0]), *starts]
+        steps = steps or (1500 if optimizer == "adam" else 500)
+        optima = maximise(problem.target, problem.argument, starts, steps=steps, **options)
+    else:
+        steps = steps or 600
+        starts = starting_points(
+            problem.target, records, restarts, steps, run.seed, run.workers, run.progress,
+            run.checkpoints,
+        )  # fmt: skip
+        warm = [] if learnt is None else [grown(learnt, starts[0])]
+        optima = climb(problem.target, problem.argument, starts, warm, steps=steps, **options)
+    if optima[0].energy >= WALL:
+        raise ValueError(
+            "fit: no start reached a point where the likelihood can be evaluated. Check the "
+            "record for jumps of many orders of magnitude, or try fewer pairs."
+        )
+    return optima
+
+
+def at_optimum(
+    model: Model, optima: Sequence[Optimum], seed: int, records: Sequence[Record]
+) -> Fitted:
+    """The fit that the best of several optima is: a posterior mode."""
+    best = optima[0]
+    return Fitted(
+        model=model,
+        posterior=Mixture.at(best.values),
+        draws=FrozenMapping({k: v.unsqueeze(0) for k, v in best.values.items()}),
+        mode=FrozenMapping(best.values),
+        history=best.history,
+        start_energies=np.array([optimum.energy for optimum in optima]),
+        diagnostics=FrozenMapping({"iterations": float(len(best.history))}),
         seed=seed,
-        workers=workers,
-        progress=progress,
-        checkpoints=checkpoints,
+        records=tuple(records),
     )
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.methods.svi import train
-from pyro_dynogp.inference.posteriors import GaussianGuide, gaussian_guide
+from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.support.checkpoints import NOTHING_KEPT, Checkpoints
 
 # Divergence of Laplace's approximation from the posterior [nats] that SVI does not mend, the draws
@@ -55,7 +55,7 @@ class VariationalPosterior:
         message: why the optimisation stopped.
     """
 
-    guide: GaussianGuide
+    guide: Mixture
     elbo: np.ndarray
     message: str
 
@@ -98,7 +98,7 @@ def variational(
     )["log"]
     if 0.5 * float(weights.var()) <= CLOSE:
         elbo = np.array([float(weights.mean())])
-        return VariationalPosterior(gaussian_guide(potential, centre, root), elbo, AS_GOOD)
+        return VariationalPosterior(Mixture.normal(potential, centre, root), elbo, AS_GOOD)
     start = {name: value.detach() for name, value in potential.unpack(centre).items()}
     guide = PreconditionedNormal(model, centre, root, init_loc_fn=init_to_value(values=start))
     order = [site.name for site in potential.sites]
@@ -120,7 +120,7 @@ def variational(
         if names != order:
             raise RuntimeError(f"The guide orders the sites {names}, the potential {order}.")
         posterior = guide.get_posterior()
-        fitted = gaussian_guide(potential, posterior.loc, posterior.scale_tril)
+        fitted = Mixture.normal(potential, posterior.loc, posterior.scale_tril)
     return VariationalPosterior(fitted, trained.elbo, trained.message)
 
 
@@ -167,5 +167,5 @@ def _independent(
             key=f"{key}-svi",
         )
         posterior = guide.get_posterior().base_dist
-        fitted = gaussian_guide(potential, posterior.loc, torch.diag(posterior.scale))
+        fitted = Mixture.normal(potential, posterior.loc, torch.diag(posterior.scale))
     return VariationalPosterior(fitted, trained.elbo, trained.message)

@@ -16,6 +16,14 @@ from torch import Tensor
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.cascade_coordinates import potential_for_sampling
+from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.methods.base import Problem
+from pyro_dynogp.inference.methods.mode import best_optima, check_optimizer
+from pyro_dynogp.inference.optimise.maximum import Optimizer
+from pyro_dynogp.inference.posteriors import Sampled
+from pyro_dynogp.inference.run import Run, at_least_one
+from pyro_dynogp.models.model import Model
+from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import child_seeds, parallel_map, seeded
 
 # How often a start is moved towards the mode, each time by a factor of sqrt(2).
@@ -37,6 +45,72 @@ class Chains:
     r_hat: dict[str, Tensor]
     effective_samples: dict[str, Tensor]
     divergences: int
+
+
+@dataclass(frozen=True)
+class Nuts:
+    """The no-U-turn sampler, from around the best optimum.
+
+    Steps of the run are those of the climbs of models that are not linear.
+
+    Attributes:
+        chains: number of them. warmup, draws: of each.
+        optimizer: for the starts, as of `Mode`.
+
+    Raises:
+        ValueError: on an unknown optimizer, or numbers below one.
+    """
+
+    chains: int = 4
+    warmup: int = 500
+    draws: int = 500
+    optimizer: Optimizer | None = None
+
+    def __post_init__(self) -> None:
+        at_least_one(chains=self.chains, warmup=self.warmup, draws=self.draws)
+        check_optimizer(self.optimizer)
+
+    def check(self, model: Model, *, warm: bool) -> None:
+        """Every model can be sampled."""
+
+    @property
+    def identity(self) -> object:
+        """All options."""
+        return self
+
+    def __call__(self, problem: Problem, run: Run) -> Fitted:
+        """Draws of all chains, one after the other."""
+        optima = best_optima(problem, run, self.optimizer, None if problem.model.is_linear
+                             else run.steps)  # fmt: skip
+        best = optima[0]
+        chain = sample_posterior(
+            problem.target,
+            problem.argument,
+            best.values,
+            chains=self.chains,
+            draws=self.draws,
+            warmup=self.warmup,
+            seed=run.seed,
+            workers=run.workers,
+            progress=run.progress,
+        )
+        diagnostics = {"divergences": float(chain.divergences), "chains": float(self.chains)}
+        for site, values in chain.r_hat.items():
+            diagnostics[f"r_hat {site}"] = float(values.max())
+        for site, values in chain.effective_samples.items():
+            diagnostics[f"effective samples {site}"] = float(values.min())
+        draws = FrozenMapping({k: v.flatten(0, 1) for k, v in chain.draws.items()})
+        return Fitted(
+            model=problem.model,
+            posterior=Sampled(draws),
+            draws=draws,
+            mode=FrozenMapping(best.values),
+            history=best.history,
+            start_energies=np.array([optimum.energy for optimum in optima]),
+            diagnostics=FrozenMapping(diagnostics),
+            seed=run.seed,
+            records=problem.records,
+        )
 
 
 @dataclass(frozen=True)

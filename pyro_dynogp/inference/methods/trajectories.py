@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -24,18 +23,23 @@ from pyro_dynogp.guides.families import (
     SameAsPrior,
 )
 from pyro_dynogp.guides.layer_guide import LayerGuide
-from pyro_dynogp.inference.fitted import Fit
-from pyro_dynogp.inference.methods.mode import GuideChoice, starting_points
+from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.methods.base import Problem
+from pyro_dynogp.inference.methods.mode import starting_points
 from pyro_dynogp.inference.methods.svi import Trained, train
+from pyro_dynogp.inference.posteriors import Sampled
+from pyro_dynogp.inference.run import Run, at_least_one
 from pyro_dynogp.layers.noise import Gaussian
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.wiring import Dynamic
 from pyro_dynogp.support.checkpoints import Checkpoints, Piece
 from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import child_seeds, parallel_map, seeded
 
 Values = dict[str, Tensor]
+GuideChoice = str | Mapping[str, Any] | Callable[..., Any]
 # Inducing times of a trajectory, as a share of its samples and at most.
 INDUCING_SHARE, INDUCING_MOST = 0.5, 400
 # First standard deviation of pseudo-observations (layers have unit scale).
@@ -93,12 +97,9 @@ def layer_guide(model: Model, choice: Any, values: Mapping[str, Tensor], n: int)
 class _Task:
     model: Model
     records: Record | tuple[Record, ...]
-    guide: Any
+    method: Trajectories
     values: Values
     steps: int
-    particles: int
-    learning_rate: float
-    draws: int
     seed: int
     key: str
     checkpoints: Checkpoints
@@ -111,18 +112,21 @@ def _run(task: _Task) -> Piece:
     def compute() -> Piece:
         args = (task.records,)
         with pyro.get_param_store().scope(), pyro.validation_enabled(False):
-            own = callable(task.guide) and not isinstance(task.guide, Mapping)
-            guide: Callable[..., Any]
+            method = task.method
+            own = callable(method.guide) and not isinstance(method.guide, Mapping)
+            guide: Any
+            through: Callable[..., Any]
             if own:
                 # A `LayerGuide` remembers the sites of its first call.
-                guide = through = copy.deepcopy(task.guide)
-                loss: Any = Trace_ELBO(num_particles=task.particles)
+                guide = copy.deepcopy(method.guide)
+                through = guide
+                loss: Any = Trace_ELBO(num_particles=method.particles)
             else:
                 n = max(len(r) for r in _several(task.records))
-                guide = layer_guide(task.model, task.guide, task.values, n)
+                guide = layer_guide(task.model, method.guide, task.values, n)
                 through = guide.single_pass()
                 loss = TraceMeanField_ELBO(
-                    num_particles=task.particles, vectorize_particles=True, max_plate_nesting=0
+                    num_particles=method.particles, vectorize_particles=True, max_plate_nesting=0
                 )
             trained = train(
                 task.model,
@@ -130,7 +134,7 @@ def _run(task: _Task) -> Piece:
                 args,
                 loss,
                 steps=task.steps,
-                learning_rate=task.learning_rate,
+                learning_rate=method.learning_rate,
                 seed=task.seed,
                 checkpoints=task.checkpoints,
                 progress=task.progress,
@@ -140,7 +144,7 @@ def _run(task: _Task) -> Piece:
                 layers={one.name: one.described for one in task.model.wires},
             )
             with seeded(task.seed):
-                draws, log_q = _draw(guide, args, task.draws, vectorised=not own)
+                draws, log_q = _draw(guide, args, method.draws, vectorised=not own)
         return _pack(trained, draws, log_q)
 
     return task.checkpoints.piece(f"{task.key}-result", compute)
@@ -212,96 +216,146 @@ def starting_trajectories(model: Model, records: Sequence[Record], values: Value
     return out
 
 
-def fit_layered(
-    model: Model,
-    records: Sequence[Record],
-    guide: GuideChoice,
-    *,
-    seed: int,
-    restarts: int,
-    steps: int,
-    particles: int,
-    learning_rate: float,
-    draws: int,
-    checkpoints: Checkpoints,
-    workers: int | None,
-    progress: bool,
-) -> Fit:
-    """Fit with trajectories as sample sites; see `fit`."""
-    own = callable(guide) and not isinstance(guide, Mapping)
-    if isinstance(guide, torch.nn.Module):
-        raise invalid(
-            "guide",
-            expected="a Pyro function whose parameters are in the parameter store",
-            got=f"{type(guide).__name__}, which holds them itself",
-            advice="Restarts would share them. Write the guide as a function with pyro.param, or "
-            "use dgp.LayerGuide.",
+@dataclass(frozen=True)
+class Trajectories:
+    """SVI with the trajectories of a model as sample sites, from every start; the best by its ELBO.
+
+    Steps of the run are those of SVI (default 1000); it has two starts by default.
+
+    Attributes:
+        guide: "gauss-markov" or "inducing times": the family of all trajectories. A mapping from
+            site names to families of `pyro_dynogp.guides`: these sites so, all others as
+            "gauss-markov" has them. A Pyro function: your own guide for the model with all its
+            trajectories.
+        draws: posterior draws to keep.
+        particles, learning_rate: of SVI.
+
+    Raises:
+        ValueError: on numbers below one, or a guide that holds its own parameters.
+    """
+
+    guide: GuideChoice = "gauss-markov"
+    draws: int = 200
+    particles: int = 8
+    learning_rate: float = 0.02
+
+    def __post_init__(self) -> None:
+        at_least_one(draws=self.draws, particles=self.particles)
+        if isinstance(self.guide, torch.nn.Module):
+            raise invalid(
+                "guide",
+                expected="a Pyro function whose parameters are in the parameter store",
+                got=f"{type(self.guide).__name__}, which holds them itself",
+                advice="Restarts would share them. Write the guide as a function with pyro.param, "
+                "or use dgp.LayerGuide.",
+            )
+
+    @property
+    def _written(self) -> bool:
+        """Whether the guide is a function of the user's."""
+        return callable(self.guide) and not isinstance(self.guide, Mapping)
+
+    def check(self, model: Model, *, warm: bool) -> None:
+        """Refuse an unknown guide, a linear model that is exact, and a start from another fit."""
+        if model.is_linear and model.integrate == "all":
+            got = repr(self.guide)
+            raise invalid("guide", expected="None for a linear model, which is exact", got=got)
+        if warm:
+            raise invalid("start", expected="None with this guide", got="a fit")
+        if not self._written:
+            layer_guide(self._target(model), self.guide, {}, 2)
+
+    @property
+    def identity(self) -> object:
+        """All options; a guide by its name and code, which are the same in every process."""
+        return (identity_of(self.guide), self.draws, self.particles, self.learning_rate)
+
+    def _target(self, model: Model) -> Model:
+        return replace(model, integrate="none") if self._written else with_trajectories(model)
+
+    def __call__(self, problem: Problem, run: Run) -> Fitted:
+        """The best start's draws, with their log-density by site."""
+        pieces = self._trained(problem, run)
+        levels = [_level(piece) for piece in pieces]
+        order = np.argsort([-level for level in levels])
+        best = pieces[int(order[0])]
+        sampled = {k[len("draw/") :]: v for k, v in best.items() if k.startswith("draw/")}
+        parameters = _parameter_sites(problem.model, problem.records)
+        missing = [name for name in parameters if name not in sampled]
+        if missing:
+            raise invalid(
+                "guide",
+                expected=f"a guide that samples every parameter, {missing} too",
+                got="not them",
+            )
+        kept = {name: sampled[name] for name in parameters}
+        elbo = best["elbo"].numpy()
+        tail = elbo[-50:]
+        log_q = {k[len("log_q/") :]: v for k, v in best.items() if k.startswith("log_q/")}
+        others = {k: v for k, v in sampled.items() if k not in kept}
+        draws = FrozenMapping(kept)
+        return Fitted(
+            model=problem.model,
+            posterior=Sampled(draws, "svi", FrozenMapping(others), FrozenMapping(log_q)),
+            draws=draws,
+            mode=FrozenMapping({k: v.median(0).values for k, v in kept.items()}),
+            history=elbo,
+            start_energies=-np.array(levels)[order],
+            diagnostics=FrozenMapping({"elbo": float(tail.mean()), "elbo_sd": float(tail.std())}),
+            seed=run.seed,
+            records=problem.records,
         )
-    target = replace(model, integrate="none") if own else with_trajectories(model)
-    if isinstance(guide, str | Mapping):
-        layer_guide(target, guide, {}, 2)  # refuse an unknown name before any work
-    argument = records[0] if len(records) == 1 else tuple(records)
-    points: list[Values] = [{}] * restarts
-    if not own:
-        found = starting_points(
-            target, records, restarts, steps, seed, workers, progress, checkpoints
+
+    def _trained(self, problem: Problem, run: Run) -> list[Piece]:
+        """What each start comes to."""
+        restarts, steps = run.restarts or 2, run.steps or 1000
+        target = self._target(problem.model)
+        points: list[Values] = [{}] * restarts
+        if not self._written:
+            found = starting_points(
+                target, problem.records, restarts, steps, run.seed, run.workers, run.progress,
+                run.checkpoints,
+            )  # fmt: skip
+            points = [{**v, **starting_trajectories(target, problem.records, v)} for v in found]
+        tasks = [
+            _Task(
+                target,
+                problem.argument,
+                self,
+                point,
+                steps,
+                seed,
+                f"start-{index}",
+                run.checkpoints,
+                run.progress and run.workers == 1,
+            )
+            for index, (point, seed) in enumerate(
+                zip(points, child_seeds(run.seed, restarts), strict=True)
+            )
+        ]
+        return parallel_map(
+            _run,
+            tasks,
+            workers=run.workers,
+            progress=run.progress,
+            description="SVI",
+            news=lambda found: f"elbo {max(_level(piece) for piece in found):.2f}",
         )
-        points = [{**v, **starting_trajectories(target, records, v)} for v in found]
-    tasks = [
-        _Task(
-            target,
-            argument,
-            guide,
-            point,
-            steps,
-            particles,
-            learning_rate,
-            draws,
-            one_seed,
-            f"start-{index}",
-            checkpoints,
-            progress and workers == 1,
-        )
-        for index, (point, one_seed) in enumerate(
-            zip(points, child_seeds(seed, restarts), strict=True)
-        )
-    ]
-    results = parallel_map(
-        _run,
-        tasks,
-        workers=workers,
-        progress=progress,
-        description="SVI",
-        news=lambda found: f"elbo {max(_level(piece) for piece in found):.2f}",
-    )
-    levels = [_level(piece) for piece in results]
-    order = np.argsort([-level for level in levels])
-    best = results[int(order[0])]
-    sampled = {k[len("draw/") :]: v for k, v in best.items() if k.startswith("draw/")}
-    parameters = _parameter_sites(model, records)
-    missing = [name for name in parameters if name not in sampled]
-    if missing:
-        raise invalid(
-            "guide", expected=f"a guide that samples every parameter, {missing} too", got="not them"
-        )
-    kept = {name: sampled[name] for name in parameters}
-    elbo = best["elbo"].numpy()
-    tail = elbo[-50:]
-    return Fit(
-        model=model,
-        method="svi",
-        draws=MappingProxyType(kept),
-        mode=MappingProxyType({k: v.median(0).values for k, v in kept.items()}),
-        history=elbo,
-        start_energies=-np.array(levels)[order],
-        diagnostics=MappingProxyType({"elbo": float(tail.mean()), "elbo_sd": float(tail.std())}),
-        seed=seed,
-        records=tuple(records),
-        trajectories=MappingProxyType({k: v for k, v in sampled.items() if k not in kept}),
-        log_q_sites=MappingProxyType(
-            {k[len("log_q/") :]: v for k, v in best.items() if k.startswith("log_q/")}
-        ),
-    )
+
+
+def identity_of(guide: GuideChoice) -> object:
+    """What tells one guide from another, the same in every process."""
+    if isinstance(guide, str):
+        return guide
+    if isinstance(guide, Mapping):
+        return sorted(guide.items())
+    named = guide if hasattr(guide, "__qualname__") else type(guide)
+    code = getattr(guide, "__code__", None)
+    body = None
+    if code is not None:
+        constants = tuple(c for c in code.co_consts if isinstance(c, int | float | str))
+        body = (code.co_code, code.co_names, constants)
+    return (named.__module__, named.__qualname__, body)
 
 
 def _parameter_sites(model: Model, records: Sequence[Record]) -> list[str]:

@@ -23,21 +23,21 @@ from pyro_dynogp.report.html.html import (
 from pyro_dynogp.report.html.scores import LEVEL, output_unit
 
 if TYPE_CHECKING:
-    from pyro_dynogp.discrepancy.report import Attempt, FoundEffect, Report
+    from pyro_dynogp.discrepancy.result import Attempt, FoundEffect, LoopResult
     from pyro_dynogp.statistics.evidence import Curve
 
 _NOTHING_ADDED = "Nothing was added: the model is the one that was given."
 _ORDER = {"accepted": 0, "tie": 1, "reported": 2, "rejected": 3, "not tried": 4}
 
 
-def effects(report: Report) -> str:
+def effects(report: LoopResult) -> str:
     """One article for each effect that was added."""
     if not report.effects:
         return paragraph(_NOTHING_ADDED)
     return "".join(_effect(report, k, one) for k, one in enumerate(report.effects, 1))
 
 
-def _effect(report: Report, k: int, effect: FoundEffect) -> str:
+def _effect(report: LoopResult, k: int, effect: FoundEffect) -> str:
     size = _size(report, effect)
     facts = [
         ("Size (root mean square)", measure(size, output_unit(report))) if size else None,
@@ -59,7 +59,7 @@ def _effect(report: Report, k: int, effect: FoundEffect) -> str:
     )
 
 
-def _size(report: Report, effect: FoundEffect) -> float | None:
+def _size(report: LoopResult, effect: FoundEffect) -> float | None:
     """Size of the effect that the accepted test of the same name and p-value gave."""
     for one in report.attempts:
         same = one.name == effect.name and one.evidence.p_value == effect.p_value
@@ -104,7 +104,7 @@ def _said(curve: Curve) -> str:
     return f"{words}, and the fitted effect as a line." if fitted.any() else f"{words}."
 
 
-def attempts(report: Report) -> str:
+def attempts(report: LoopResult) -> str:
     """Tables of what was refitted, and of what was not worth it."""
     tried = [one for one in report.attempts if one.decision != "not tried"]
     untried = [one for one in report.attempts if one.decision == "not tried"]

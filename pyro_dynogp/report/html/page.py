@@ -22,7 +22,7 @@ from pyro_dynogp.report.html.style import STYLE
 
 if TYPE_CHECKING:
     from pyro_dynogp.data.record import Record
-    from pyro_dynogp.discrepancy.report import Report
+    from pyro_dynogp.discrepancy.result import LoopResult
 
 _NUMBERS = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine")
 _HOW_TO_READ = (
@@ -48,7 +48,7 @@ _TERMS = (
 )
 
 
-def page(report: Report) -> str:
+def page(report: LoopResult) -> str:
     """One HTML page without scripts or anything from outside.
 
     Args:
@@ -82,7 +82,7 @@ def page(report: Report) -> str:
     )
 
 
-def _headline(report: Report) -> str:
+def _headline(report: LoopResult) -> str:
     """The outcome in one sentence."""
     count, left = len(report.effects), "structure left" in report.outcome
     if count:
@@ -98,7 +98,7 @@ def _headline(report: Report) -> str:
     return f"{report.outcome[:1].upper()}{report.outcome[1:]}."
 
 
-def _key(report: Report) -> str:
+def _key(report: LoopResult) -> str:
     """The one number that most readers want."""
     before, after = report.before.get("rmse", np.nan), report.after.get("rmse", np.nan)
     unit, n = output_unit(report), len(report.sealed)
@@ -114,13 +114,13 @@ def _key(report: Report) -> str:
     return paragraph(f"{words}.", "lead")
 
 
-def _warnings(report: Report) -> str:
+def _warnings(report: LoopResult) -> str:
     if not report.warnings:
         return ""
     return f'<aside class="warning"><h2>Warnings</h2>{items(report.warnings)}</aside>'
 
 
-def _models(report: Report) -> str:
+def _models(report: LoopResult) -> str:
     before, after = report.model_before, report.model_after
     if tuple(before) == tuple(after):
         drawn = diagram(before, [""] * len(before), "Model")
@@ -135,7 +135,7 @@ def _models(report: Report) -> str:
     )
 
 
-def _data(report: Report) -> str:
+def _data(report: LoopResult) -> str:
     known, sealed = report.known, report.sealed
     rows = [
         ["Known: fitted to, and searched", str(len(known)), *_ends(known)],
@@ -171,7 +171,7 @@ def _ends(record: Record) -> tuple[str, str]:
     return first_shown.strip(), last_shown.strip()
 
 
-def _times(report: Report) -> str:
+def _times(report: LoopResult) -> str:
     if not report.seconds:
         return paragraph("No times were taken.")
     rows = [[name, duration(value)] for name, value in report.seconds.items()]

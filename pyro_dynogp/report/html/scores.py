@@ -19,7 +19,7 @@ from pyro_dynogp.report.html.html import (
 )
 
 if TYPE_CHECKING:
-    from pyro_dynogp.discrepancy.report import Report
+    from pyro_dynogp.discrepancy.result import LoopResult
 
 # A test fails below this p-value.
 LEVEL = 0.05
@@ -39,7 +39,7 @@ _SHARES = {
 }
 
 
-def output_unit(report: Report) -> str:
+def output_unit(report: LoopResult) -> str:
     """Unit of the outputs where all have the same, else ""."""
     units = set(report.sealed.output_units)
     return units.pop() if len(units) == 1 else ""
@@ -79,7 +79,7 @@ def change_of_elpd(gain: float, error: float) -> Cell:
     return Cell((f"{kind}: more than two standard errors",), kind)
 
 
-def scores(report: Report) -> str:
+def scores(report: LoopResult) -> str:
     """Table of scores on the sealed block, and both figures."""
     from pyro_dynogp.report.figures import before_after, residuals_before_after
 
@@ -109,7 +109,7 @@ def scores(report: Report) -> str:
     )
 
 
-def _closer(report: Report, alt: str) -> str:
+def _closer(report: LoopResult, alt: str) -> str:
     """A stretch in the middle of a record that is too long to see one sample after another."""
     from pyro_dynogp.report.figures import before_after
 
@@ -122,7 +122,7 @@ def _closer(report: Report, alt: str) -> str:
     return picture(figure, f"{alt}: {words}.", f"The same forecast closer: {words}.")
 
 
-def _table(report: Report) -> str:
+def _table(report: LoopResult) -> str:
     unit, added = output_unit(report), bool(report.effects)
     rows: list[list[str | Cell]] = []
     for name, words in (*_ERRORS.items(), *((k, v[0]) for k, v in _SHARES.items())):
@@ -146,7 +146,7 @@ def _table(report: Report) -> str:
     return table(caption, ["Score", "Before", "After", "In words"], rows, "tnnt")
 
 
-def _rmse_in_words(report: Report) -> str:
+def _rmse_in_words(report: LoopResult) -> str:
     before, after = report.before.get("rmse", np.nan), report.after.get("rmse", np.nan)
     unit = output_unit(report)
     if not report.effects:
@@ -154,7 +154,7 @@ def _rmse_in_words(report: Report) -> str:
     return f"Root mean square error {measure(before, unit)} before, {measure(after, unit)} after."
 
 
-def tests(report: Report) -> str:
+def tests(report: LoopResult) -> str:
     """Table of the tests on the sealed block, those that changed first."""
     if not report.tests:
         return paragraph("No test was repeated on the sealed data.")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pyro_dynogp.discrepancy.reporting import does_not_pay
+from pyro_dynogp.report.last_block import does_not_pay
 
 BEFORE = {"rmse": 1.0, "crps": 0.5}
 

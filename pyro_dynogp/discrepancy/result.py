@@ -14,7 +14,7 @@ from pyro_dynogp.statistics.evidence import Curve, Evidence
 
 if TYPE_CHECKING:
     from pyro_dynogp.data.record import Record
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.fitting import Fit
     from pyro_dynogp.models.description import Part
     from pyro_dynogp.prediction.prediction import Prediction
 
@@ -79,7 +79,7 @@ class FoundEffect:
 
 
 @dataclass(frozen=True, eq=False)
-class Report:
+class LoopResult:
     """Result of `close_loop`.
 
     Attributes:
@@ -144,12 +144,6 @@ class Report:
         """Write `to_dict` to a file; numbers that are not finite become null."""
         text = json.dumps(_finite(self.to_dict()), indent=1, allow_nan=False)
         Path(path).write_text(text + "\n", encoding="utf-8")
-
-    def to_html(self, path: str | Path) -> None:
-        """Write one self-contained page, figures inside."""
-        from pyro_dynogp.report.html.page import page
-
-        Path(path).write_text(page(self), encoding="utf-8")
 
     def __str__(self) -> str:
         lines = [f"{self.outcome[:1].upper()}{self.outcome[1:]}."]

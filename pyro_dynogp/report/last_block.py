@@ -12,7 +12,7 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.context import SearchContext
 from pyro_dynogp.discrepancy.decision import Confirmed
 from pyro_dynogp.discrepancy.parameters import parameters_of
-from pyro_dynogp.discrepancy.report import FoundEffect, Report
+from pyro_dynogp.discrepancy.result import FoundEffect
 from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
 from pyro_dynogp.discrepancy.state import SearchState
@@ -21,11 +21,12 @@ from pyro_dynogp.effects.base import Effect, experiment
 from pyro_dynogp.models.description import describe, in_words
 from pyro_dynogp.prediction.records import joined
 from pyro_dynogp.prediction.scores import scores
+from pyro_dynogp.report.report import Report
 from pyro_dynogp.statistics.evidence import Residuals
 from pyro_dynogp.support.parallel import parallel_map
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.fitting import Fit
 
 SCORES = ("rmse", "mae", "nrmse", "crps", "coverage_50", "coverage_95")
 

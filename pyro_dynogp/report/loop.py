@@ -10,22 +10,22 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.blocks import blocks_of
 from pyro_dynogp.discrepancy.context import SearchContext, Stopwatch
 from pyro_dynogp.discrepancy.refits import poles_of, quick_fit
-from pyro_dynogp.discrepancy.report import Report
-from pyro_dynogp.discrepancy.reporting import report_of
 from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
 from pyro_dynogp.discrepancy.state import SearchState
 from pyro_dynogp.discrepancy.trials import without
 from pyro_dynogp.effects import CATALOGUE, Effect
-from pyro_dynogp.inference.fit import fit as fit_model
+from pyro_dynogp.fitting import fit as fit_model
 from pyro_dynogp.inference.refit import family_of
 from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.variants import used_channels
+from pyro_dynogp.report.last_block import report_of
+from pyro_dynogp.report.report import Report
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.parallel import one_thread, parallel_map
 
 if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fit
+    from pyro_dynogp.fitting import Fit
 
 # Fresh starts of the last fits, of linear models and of cascades.
 LAST_LINEAR_STARTS, LAST_CASCADE_STARTS = 2, 1

@@ -1,0 +1,242 @@
+"""Fit a model to measured records: one call for every model and method, one frozen result."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from pyro_dynogp.criticism import inference_data
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.inference import storage
+from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.methods.base import Method
+from pyro_dynogp.inference.summary import summary
+from pyro_dynogp.inference.training import train_model
+from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.outputs import output_process
+from pyro_dynogp.prediction import layers as _layers
+from pyro_dynogp.prediction import predict as _predict
+from pyro_dynogp.prediction.first_state import beginning
+from pyro_dynogp.prediction.layers import LayerTrajectory, StaticBand
+from pyro_dynogp.prediction.prediction import Prediction
+
+__all__ = ["Fit", "fit", "load"]
+
+
+class Fit(Fitted):
+    """A fitted model, and what can be done with it.
+
+    The attributes are those of `Fitted`.
+    """
+
+    def layers(self, record: Record) -> Mapping[str, LayerTrajectory]:
+        """Posterior trajectories of all layers along a record, given its inputs and outputs.
+
+        Exactly for linear models, by the smoother of the moment-matching filter for others. A
+        record without outputs gives the trajectories that the inputs alone say.
+        """
+        return _layers.layers(self, record)
+
+    def static_function(
+        self, name: str, record: Record, *, channel: int = 0, points: int = 200
+    ) -> StaticBand:
+        """A static layer's function with its band, where a record moves it.
+
+        Args:
+            name: of the layer. record: says over which range, and where data are.
+            channel: the input that varies, others at their mean. points: number of points.
+        """
+        return _layers.static_function(self, name, record, channel, points)
+
+    def log_likelihood(self, records: Record | Sequence[Record]) -> np.ndarray:
+        """Log p(y | draw) (S,) [nats], exact marginal likelihood in the units of the record."""
+        total: Any = 0.0
+        with torch.no_grad():
+            for record in self.model.check(records):
+                outputs = output_process(beginning(self, record), self.scaling, record)
+                total = total + outputs.log_prob(record.tensors().observations)
+        return total.numpy()
+
+    def simulate(
+        self, record: Record, *, process_noise: bool = True, samples: int = 200, seed: int = 0
+    ) -> Prediction:
+        """Outputs from the inputs alone, from an unknown initial state.
+
+        Args:
+            record: time and inputs; its outputs are not used.
+            process_noise: False for the response of the deterministic system.
+            samples: number of joint samples that `Prediction.samples` draws. seed: for these.
+        """
+        return _predict.simulate(self, record, process_noise, samples, seed)
+
+    def predict(
+        self, record: Record, *, horizon: int = 1, samples: int = 200, seed: int = 0
+    ) -> Prediction:
+        """Each output from the inputs and from the outputs up to `horizon` samples before it.
+
+        Exact Kalman predictions. Samples of a linear model are its mean plus errors with their
+        joint law over time (a moving average of `horizon` innovations on a regular record); those
+        of a cascade are independent from time to time.
+        """
+        return _predict.predict(self, record, horizon, samples, seed)
+
+    def forecast(
+        self,
+        past: Record,
+        future: Record,
+        *,
+        process_noise: bool = True,
+        samples: int = 200,
+        seed: int = 0,
+    ) -> Prediction:
+        """Outputs of `future` given inputs and outputs of `past`, the state carried over exactly.
+
+        Args:
+            past: up to now. future: later times, with inputs; its outputs are not used.
+            process_noise: False if the future is known to have none.
+            samples: number of joint samples. seed: for these.
+        """
+        return _predict.forecast(self, past, future, process_noise, samples, seed)
+
+    def innovations(self, record: Record) -> np.ndarray:
+        """Standardised one-step prediction errors (n, n_y); NaN where the output is missing.
+
+        White and standard normal if the model is right: errors over their standard deviation where
+        the prediction is Gaussian, else its normal scores (`Prediction.normal_scores`).
+        """
+        return self.predict(record, horizon=1).normal_scores(record.outputs)
+
+    def save(self, path: str | Path) -> None:
+        """Write the fit to one safetensors file, from which `pyro_dynogp.load` restores it.
+
+        `trajectories` are left out: draws over the whole training record, which no prediction
+        needs; `layers` computes smoothed ones.
+
+        Raises:
+            ValueError: where the folder does not exist, or a static layer has a gpytorch kernel of
+                its own: a file holds numbers, no code.
+        """
+        storage.save(self, path)
+
+    def to_arviz(
+        self,
+        *,
+        future: Record | None = None,
+        samples: int = 200,
+        prior_samples: int = 200,
+        seed: int = 0,
+    ) -> Any:
+        """The fit as ArviZ's InferenceData, for `arviz` plots, tables and files.
+
+        Groups:
+
+        - posterior: every latent site (chain, draw, *shape), in scaled units; trajectories where
+          the guide had them; and in physical units decay rate, frequency and time constant of each
+          pole, gains of a linear model, scale of the measurement noise and offset of the outputs.
+          Chains are those of NUTS, else one; "map" has one draw.
+        - prior, prior_predictive: the same sites and quantities from the prior, outputs at them;
+          left out with ``priors="paper"``, whose draws exceed floating-point range.
+        - posterior_predictive: replicated outputs of the training record, jointly, from its inputs
+          alone, at draws spread evenly over all of them.
+        - predictions, predictions_constant_data: forecast of `future` after the last training
+          record, on its own clock.
+        - log_likelihood: one-step-ahead density of each output, trajectories integrated out [nats];
+          they add up to `log_likelihood`, NaN where an output is missing. Do not give them to
+          ``az.loo``: they are not independent given the draw. `pyro_dynogp.loo` is for that.
+        - sample_stats: ``lp``, log p(y, values) of each draw; of a variational posterior ``log_q``
+          and, in attrs, the Pareto shape of their ratios; what `diagnostics` holds, in attrs.
+        - observed_data ``y`` and constant_data: inputs ``u``, and ``elbo`` ("svi") or ``log_joint``
+          by step.
+
+        Several records give ``y_0``, ``y_1``, ... over ``time_0``, ``time_1``, ...; times are UTC
+        time stamps where the record has them. Units are in attrs of the variables and in the
+        labels ``input_unit`` and ``output_unit``.
+
+        Args:
+            future: a later record with inputs; its outputs are not used.
+            samples: number of replicates and of forecasts. prior_samples: of prior draws, 0 for
+                none. seed: for all of them.
+
+        Raises:
+            ValueError: on numbers that make no sense, a `future` that does not follow the last
+                training record or has other channels, and layers named as a dimension is.
+        """
+        return inference_data.to_arviz(
+            self, future=future, samples=samples, prior_samples=prior_samples, seed=seed
+        )
+
+    def summary(self) -> str:
+        """A few lines: what was fitted, how well it went, the modes at the best optimum."""
+        return summary(self)
+
+
+def fit(
+    model: Model,
+    record: Record | Sequence[Record],
+    *,
+    method: str | Method | None = None,
+    start: Fitted | None = None,
+    seed: int = 0,
+    restarts: int | None = None,
+    steps: int | None = None,
+    checkpoint: str | Path | None = None,
+    workers: int | None = None,
+    progress: bool = True,
+    **options: Any,
+) -> Fit:
+    """Fit a model to one record, or to several that share all parameters.
+
+    The marginal posterior (exact for a linear model, by the moment-matching filter for others) is
+    climbed from several starts, in parallel. `Mode` ("map") keeps the best optimum; `Normal`
+    ("svi") fits normals to the posterior around the best optima; `Nuts` ("nuts") samples it. The
+    starts of a cascade are the best linear fits, spread over its layers; where static layers see
+    process noise they climb without any first, and the better half continues with it. With
+    `Trajectories` trajectories stay sample sites, and Pyro's SVI fits them and the parameters
+    together.
+
+    Args:
+        model: a `LinearDynamicGP` or a `Cascade` (`Wiener`, `Hammerstein`, ...).
+        record: training record, or a sequence of them; scaling is learnt from it alone.
+        method: "map", "svi", "nuts", or an object with options of its own: `Mode`, `Normal`,
+            `Nuts`, `Trajectories`. By default "svi" where the model has static layers, else "map".
+        start: a fit to start from beside the restarts: of the same model to other data, or of a
+            model that this one extends (what sites have in common is taken over).
+        seed: the same seed gives the same numbers to the last bit on one machine.
+        restarts: number of starting points (default 6; 8 with static layers; 2 of
+            `Trajectories`).
+        steps: most iterations of a start (default 500; Adam 1500; cascades 600) and, with "svi", of
+            SVI (default 1000; with static layers 60, and no more while hyperparameters stay at the
+            optimum, around which it begins all but normal).
+        checkpoint: a folder that keeps finished pieces of the work. The same call continues from
+            there after a kill, and ends in the same bits.
+        workers: processes; None for all processors, 1 for none but this one.
+        progress: whether to show progress bars.
+        options: of the method that a short name stands for: ``optimizer``; ``hyperparameters``
+            (`family` of `Normal`), ``draws``, ``particles``, ``learning_rate``; ``chains``,
+            ``warmup``; ``guide``, which stands for `Trajectories`.
+
+    Raises:
+        ValueError: on channels that do not fit the model, constant or entirely missing outputs,
+            unknown options or such that the method does not use, or where no start leads anywhere.
+    """
+    return Fit.of(
+        train_model(
+            model, record, method=method, options=options, start=start, seed=seed,
+            restarts=restarts, steps=steps, checkpoint=checkpoint, workers=workers,
+            progress=progress,
+        )
+    )  # fmt: skip
+
+
+def load(path: str | Path) -> Fit:
+    """Read a fit that `Fit.save` wrote.
+
+    Raises:
+        ValueError: where the file is missing, damaged, not a pyro_dynogp fit, or of a version
+            that this package does not know.
+    """
+    return Fit.of(storage.load(path))
