@@ -14,7 +14,7 @@ from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.methods.mode import at_optimum, climb, grow, starting_points
 from pyro_dynogp.inference.optimise.descent import descend
 from pyro_dynogp.inference.optimise.lockstep import Functions
-from pyro_dynogp.inference.optimise.maximum import Optimum, maximise
+from pyro_dynogp.inference.optimise.maximum import Effort, Optimum, maximise
 from pyro_dynogp.inference.optimise.side_by_side import each_in_lockstep
 from pyro_dynogp.inference.starts.dynamic import Values
 from pyro_dynogp.inference.starts.poles import (
@@ -176,7 +176,7 @@ def _further(found: Fit, seed: int) -> Fit:
     """More steps of a cascade's climb that has begun."""
     optima = maximise(
         found.model.collapsed, found.records[0], [dict(found.mode)], optimizer="preconditioned",
-        steps=MORE_STEPS, seed=seed, workers=1, near=True,
+        steps=MORE_STEPS, seed=seed, workers=1, effort=Effort(near=True),
     )  # fmt: skip
     return Fit.of(at_optimum(found.model, optima, seed, found.records))
 
@@ -190,7 +190,7 @@ def _linear(
 ) -> list[Optimum]:
     return maximise(
         model.collapsed, records[0], starts, optimizer="preconditioned", steps=steps, seed=seed,
-        workers=1, together=TOGETHER, kept=KEPT,
+        workers=1, effort=Effort(together=TOGETHER, kept=KEPT),
     )  # fmt: skip
 
 
@@ -228,7 +228,7 @@ def _fresh(model: Model, records: Sequence[Record], seed: int) -> list[Optimum]:
     starts = starting_points(target, records, count, LINEAR_STEPS, seed, 1, False, NOTHING_KEPT)
     return climb(
         target, records[0], starts, [], optimizer="adam", steps=CASCADE_STEPS, seed=seed,
-        workers=1, together=TOGETHER,
+        workers=1, effort=Effort(together=TOGETHER),
     )  # fmt: skip
 
 

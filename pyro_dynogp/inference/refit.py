@@ -19,7 +19,7 @@ from pyro_dynogp.inference.methods.optima import (
     free_sites,
     posterior_of,
 )
-from pyro_dynogp.inference.optimise.maximum import Optimum, maximise
+from pyro_dynogp.inference.optimise.maximum import Effort, Optimum, maximise
 from pyro_dynogp.inference.posteriors import Mixture, Sampled, draws_of_guide
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.support.errors import invalid
@@ -68,8 +68,7 @@ def refit(fit: FittedKind, records: Record | Sequence[Record]) -> FittedKind:
         steps=CASCADE_STEPS if cascade else LINEAR_STEPS,
         seed=fit.seed,
         workers=1,
-        kept=1.0,
-        rate=REFIT_RATE,
+        effort=Effort(kept=1.0, rate=REFIT_RATE),
     )
     best = optima[0]
     changed: dict[str, Any] = {

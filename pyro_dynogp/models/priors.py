@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
 
@@ -30,7 +30,6 @@ from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.distributions.decay import LogDecayRate
 from pyro_dynogp.distributions.shared_scale import SharedScaleNormal
 from pyro_dynogp.layers.sites import Site, Values, sample
-from pyro_dynogp.lti.covariance import real_covariance
 from pyro_dynogp.lti.modes import Modes, NoiseStructure
 from pyro_dynogp.support.errors import invalid
 
@@ -339,39 +338,3 @@ def unit_direction(raw: Tensor) -> Tensor:
     first = raw[..., :1, :]
     turned = raw * (first.conj() / first.abs())
     return turned / raw.abs().square().sum(-2, keepdim=True).sqrt()
-
-
-def with_direct(modes: Modes, weights: Tensor) -> Modes:
-    """The system with more inputs, which act on the output alone: weights (*b, n_y, K)."""
-    B, D = modes.B, modes.D
-    silent = torch.zeros((*B.shape[:-1], weights.shape[-1]), dtype=B.dtype)
-    batch = torch.broadcast_shapes(D.shape[:-1], weights.shape[:-1])
-    joined = torch.cat([part.expand((*batch, part.shape[-1])) for part in (D, weights)], -1)
-    if not modes.several_outputs:
-        joined = joined.squeeze(-2)
-    return replace(modes, input_gain=torch.cat([B, silent], -1), feedthrough=joined)
-
-
-def past_input_covariance(modes: Modes, memory: float) -> Tensor:
-    """Covariance (*b, 2P, 2P) of [Re x; Im x] after unknown past inputs of unit variance.
-
-    Each input is taken as the sum of a random constant, which holds the state at -B/lambda, and
-    of white noise of intensity 2 memory, as of an input that forgets within `memory` [s].
-    """
-    lam, B = modes.poles, modes.B
-    held = B / lam.unsqueeze(-1)
-    hermitian = held @ held.mH - 2.0 * memory * (B @ B.mH) / (
-        lam.unsqueeze(-1) + lam.conj().unsqueeze(-2)
-    )
-    symmetric = held @ held.mT - 2.0 * memory * (B @ B.mT) / (lam.unsqueeze(-1) + lam.unsqueeze(-2))
-    return real_covariance(hermitian, symmetric)
-
-
-def initial_mean(covariance: Tensor, standard: Tensor) -> Tensor:
-    """Initial state (*b, P), complex, with the given covariance, from standard normals (*b, 2P)."""
-    J = covariance.shape[-1]
-    ridge = 1e-9 * covariance.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] + 1e-150
-    eye = torch.eye(J, dtype=covariance.dtype)
-    root = torch.linalg.cholesky(covariance + ridge * eye)
-    x = (root @ standard.unsqueeze(-1)).squeeze(-1)
-    return torch.complex(x[..., : J // 2], x[..., J // 2 :])

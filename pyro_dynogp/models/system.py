@@ -19,7 +19,7 @@ from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import Response, mean_response
 from pyro_dynogp.lti.state import ModalState
-from pyro_dynogp.models.priors import initial_mean, past_input_covariance, with_direct
+from pyro_dynogp.models.past_inputs import initial_mean, past_input_covariance, with_direct
 from pyro_dynogp.models.wiring import INPUTS, Wire
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.tensors import as_tensor, broadcast

@@ -16,7 +16,7 @@ from pyro.optim import ClippedAdam
 
 import pyro_dynogp as dgp
 from pyro_dynogp.inference.density import Potential
-from pyro_dynogp.inference.methods.trajectories import layer_guide, with_trajectories
+from pyro_dynogp.inference.methods.trajectory_guide import layer_guide, with_trajectories
 from pyro_dynogp.models.architectures import Cascade
 
 # Seconds of one epoch of the authors' code on two cores of such a machine: mini-batch times by

@@ -12,7 +12,7 @@ from pyro.infer.autoguide import AutoNormal
 
 import pyro_dynogp as dgp
 from pyro_dynogp.guides.families import Point
-from pyro_dynogp.inference.methods.trajectories import layer_guide
+from pyro_dynogp.inference.methods.trajectory_guide import layer_guide
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.starts.plans import Plan, linear_twin, starting_point
 from pyro_dynogp.inference.starts.poles import starting_values

@@ -11,7 +11,7 @@ from pyro.infer.inspect import get_model_relations
 import pyro_dynogp as dgp
 from pyro_dynogp.lti.covariance import real_covariance
 from pyro_dynogp.models.outputs import output_process
-from pyro_dynogp.models.priors import past_input_covariance
+from pyro_dynogp.models.past_inputs import past_input_covariance
 
 
 def latent(trace):

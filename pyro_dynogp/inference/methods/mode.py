@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, get_args
 
 import numpy as np
@@ -13,7 +13,7 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.density import WALL
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.methods.base import Problem
-from pyro_dynogp.inference.optimise.maximum import Optimizer, Optimum, maximise
+from pyro_dynogp.inference.optimise.maximum import EFFORT, Optimizer, Optimum, maximise
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.plans import (
@@ -216,7 +216,8 @@ def climb(
     explain all that dynamics and functions should: from a poor start to a high density and poor
     forecasts.
     """
-    options |= {"checkpoints": checkpoints, "kept": 0.5}
+    options["checkpoints"] = checkpoints
+    options["effort"] = replace(options.get("effort", EFFORT), kept=0.5)
     quiet = without_noise_below_functions(model)
     if quiet != model and starts:
         steps = max(1, steps // 2)

@@ -20,6 +20,8 @@ from tqdm import tqdm
 from pyro_dynogp.support.checkpoints import Checkpoints, Piece
 from pyro_dynogp.support.parallel import seeded
 
+# Steps without a rise after which training ends.
+PATIENCE = 200
 # Steps between two checkpoints, and over which the ELBO is averaged.
 CHUNK = 50
 
@@ -78,15 +80,13 @@ def train(
     seed: int,
     checkpoints: Checkpoints,
     progress: bool,
-    label: str = "SVI",
     key: str = "svi",
-    patience: int = 200,
     rise: float = 0.05,
     layers: Mapping[str, str] = MappingProxyType({}),
 ) -> Trained:
     """Maximise an ELBO in the current parameter store, which should be a scope of its own.
 
-    Stops early when the ELBO, averaged over 50 steps, has not risen by `rise` nats in `patience`
+    Stops early when the ELBO, averaged over 50 steps, has not risen by `rise` nats in 200
     steps. The learning rate falls to a tenth over all steps.
 
     Args:
@@ -104,7 +104,7 @@ def train(
     live = True  # whether store and optimiser are where `state` says
     best, best_step = -np.inf, 0
     message = "all steps used"
-    with tqdm(total=steps, desc=label, disable=not progress) as bar, seeded(seed):
+    with tqdm(total=steps, desc=key, disable=not progress) as bar, seeded(seed):
         while len(elbo) < steps:
             first, count = len(elbo), min(CHUNK, steps - len(elbo))
             before, ready = state, live
@@ -127,7 +127,7 @@ def train(
             bar.set_postfix(elbo=f"{smoothed:.2f}", refresh=False)
             if smoothed > best + rise:
                 best, best_step = smoothed, len(elbo)
-            elif len(elbo) - best_step >= patience:
+            elif len(elbo) - best_step >= PATIENCE:
                 message = "the ELBO no longer rises"
                 break
         if state is not None and not live:

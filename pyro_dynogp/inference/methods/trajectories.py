@@ -14,83 +14,27 @@ from pyro.infer import Trace_ELBO, TraceMeanField_ELBO
 from torch import Tensor
 
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.guides.families import (
-    Family,
-    FullRank,
-    GaussMarkov,
-    InducingTimes,
-    MeanField,
-    SameAsPrior,
-)
-from pyro_dynogp.guides.layer_guide import LayerGuide
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.mode import starting_points
 from pyro_dynogp.inference.methods.svi import Trained, train
+from pyro_dynogp.inference.methods.trajectory_guide import (
+    GuideChoice,
+    identity_of,
+    layer_guide,
+    parameter_sites,
+    starting_trajectories,
+    with_trajectories,
+)
 from pyro_dynogp.inference.posteriors import Sampled
 from pyro_dynogp.inference.run import Run, at_least_one
-from pyro_dynogp.layers.noise import Gaussian
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.outputs import output_process
-from pyro_dynogp.models.wiring import Dynamic
 from pyro_dynogp.support.checkpoints import Checkpoints, Piece
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import child_seeds, parallel_map, seeded
 
 Values = dict[str, Tensor]
-GuideChoice = str | Mapping[str, Any] | Callable[..., Any]
-# Inducing times of a trajectory, as a share of its samples and at most.
-INDUCING_SHARE, INDUCING_MOST = 0.5, 400
-# First standard deviation of pseudo-observations (layers have unit scale).
-PSEUDO_SD = 0.3
-
-
-def with_trajectories(model: Model) -> Model:
-    """The model that a guide of layers fits: a linear Gaussian last layer is integrated exactly."""
-    exact = isinstance(model.layers[-1], Dynamic) and model.likelihood == Gaussian()
-    return replace(model, integrate="last" if exact else "none")
-
-
-def layer_guide(model: Model, choice: Any, values: Mapping[str, Tensor], n: int) -> LayerGuide:
-    """Guide for a cascade with its trajectories as sites.
-
-    Trajectories: Gauss-Markov sites or inducing times; whitened inducing values: a multivariate
-    normal for each static layer; values of a last static layer and residuals of functions: as the
-    model has them; everything else: mean field. A mapping overrides single sites.
-
-    Raises:
-        ValueError: for an unknown name.
-    """
-    kinds: dict[str, Family] = {
-        "gauss-markov": GaussMarkov(init_sd=PSEUDO_SD),
-        "inducing times": InducingTimes(
-            count=min(n, INDUCING_MOST, max(2, int(INDUCING_SHARE * n))), init_scale=0.1
-        ),
-    }
-    chosen: Mapping[str, Family] = {} if isinstance(choice, str) else choice
-    kind = choice if isinstance(choice, str) else "gauss-markov"
-    if kind not in kinds:
-        raise invalid(
-            "guide",
-            expected=f"'collapsed', one of {sorted(kinds)}, a mapping of sites to families, or a "
-            "Pyro function",
-            got=repr(choice),
-        )
-    statics = {one.name for one in model.wires if not isinstance(one.layer, Dynamic)}
-
-    def family(name: str, prior: Any) -> Family:
-        base, _, number = name.rpartition("_")
-        layer = base if number.isdigit() else name
-        if any(layer == one.name for one in model.wires if isinstance(one.layer, Dynamic)):
-            return kinds[kind]
-        if layer in statics or (name.endswith("_residual") and base in statics):
-            return SameAsPrior()
-        if name.endswith("_values") and base in statics:
-            return FullRank(init_scale=0.03)
-        return MeanField(init_scale=0.03)
-
-    return LayerGuide(model, chosen, family, values=values)
 
 
 @dataclass(frozen=True)
@@ -138,7 +82,6 @@ def _run(task: _Task) -> Piece:
                 seed=task.seed,
                 checkpoints=task.checkpoints,
                 progress=task.progress,
-                label=task.key,
                 key=task.key,
                 rise=0.5,
                 layers={one.name: one.described for one in task.model.wires},
@@ -195,25 +138,6 @@ def _draw(
         traces = [latent(pyro.poutine.trace(guide).get_trace(*args)) for _ in range(count)]
     log_q = stack([{k: v.sum() for k, v in one.items()} for _, one in traces])
     return stack([own for own, _ in traces]), log_q
-
-
-def starting_trajectories(model: Model, records: Sequence[Record], values: Values) -> Values:
-    """First trajectories of the dynamic layers: smoothed by the moment-matching filter."""
-    assert model.scaling is not None
-    out: Values = {}
-    for index, record in enumerate(records):
-        suffix = "" if len(records) == 1 else f"_{index}"
-        with torch.no_grad():
-            system = model.collapsed.system(values, model.scaling)
-            system = model.begin(system, model.states_of(values, suffix))
-            outputs = output_process(system, model.scaling, record)
-            found = outputs.smooth(record.tensors().observations)
-        for one in model.wires:
-            integrated = one.last and model.integrate == "last"
-            if isinstance(one.layer, Dynamic) and not integrated:
-                path = torch.tensor(found[one.name].mean[0])
-                out[one.name + suffix] = path if one.layer.outputs > 1 else path[:, 0]
-    return out
 
 
 @dataclass(frozen=True)
@@ -280,7 +204,7 @@ class Trajectories:
         order = np.argsort([-level for level in levels])
         best = pieces[int(order[0])]
         sampled = {k[len("draw/") :]: v for k, v in best.items() if k.startswith("draw/")}
-        parameters = _parameter_sites(problem.model, problem.records)
+        parameters = parameter_sites(problem.model, problem.records)
         missing = [name for name in parameters if name not in sampled]
         if missing:
             raise invalid(
@@ -341,24 +265,3 @@ class Trajectories:
             description="SVI",
             news=lambda found: f"elbo {max(_level(piece) for piece in found):.2f}",
         )
-
-
-def identity_of(guide: GuideChoice) -> object:
-    """What tells one guide from another, the same in every process."""
-    if isinstance(guide, str):
-        return guide
-    if isinstance(guide, Mapping):
-        return sorted(guide.items())
-    named = guide if hasattr(guide, "__qualname__") else type(guide)
-    code = getattr(guide, "__code__", None)
-    body = None
-    if code is not None:
-        constants = tuple(c for c in code.co_consts if isinstance(c, int | float | str))
-        body = (code.co_code, code.co_names, constants)
-    return (named.__module__, named.__qualname__, body)
-
-
-def _parameter_sites(model: Model, records: Sequence[Record]) -> list[str]:
-    """Names of the sites that the collapsed model has."""
-    assert model.scaling is not None
-    return [site.name for site in model.collapsed.all_sites(model.scaling, len(records))]

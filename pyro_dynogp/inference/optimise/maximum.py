@@ -34,6 +34,27 @@ TOGETHER, BATCH_SAMPLES = 4, 8000
 
 
 @dataclass(frozen=True)
+class Effort:
+    """How starts share the work.
+
+    Attributes:
+        kept: share of the starts that climbs to the end.
+        rate: Adam's first step, in unconstrained units.
+        together: most starts that climb side by side where evaluating them at once pays.
+        near: whether starts are near their optima: optimisers that make use of the curvature do so
+            at once.
+    """
+
+    kept: float = 1 / 3
+    rate: float = RATE
+    together: int = TOGETHER
+    near: bool = False
+
+
+EFFORT = Effort()
+
+
+@dataclass(frozen=True)
 class Optimum:
     """What one start came to.
 
@@ -202,20 +223,14 @@ def maximise(
     progress: bool = False,
     checkpoints: Checkpoints = NOTHING_KEPT,
     key: str = "optimum",
-    kept: float = 1 / 3,
-    rate: float = RATE,
-    together: int = TOGETHER,
-    near: bool = False,
+    effort: Effort = EFFORT,
 ) -> list[Optimum]:
     """Climb from every start; the optima sorted by energy, best first.
 
-    All starts get a fifth of the steps, then the best of them, the share `kept`, the rest
-    (successive halving: a start that is far behind by then hardly ever wins). The mode is that of
-    the density of the constrained values (no Jacobian), as AutoDelta has it. `rate` is Adam's
-    first step, in unconstrained units. Starts are `near` their optima where others have climbed
-    before: optimisers that make use of the curvature do so at once. Up to `together` starts climb
-    side by side where evaluating them at once pays; how many does not depend on the number of
-    processors, nor does the result.
+    All starts get a fifth of the steps, then the best of them the rest (successive halving: a start
+    that is far behind by then hardly ever wins). The mode is that of the density of the constrained
+    values (no Jacobian), as AutoDelta has it. The result does not depend on the number of
+    processors.
     """
 
     def climb(values: Sequence[dict[str, Tensor]], count: int, label: str) -> list[Optimum]:
@@ -229,10 +244,10 @@ def maximise(
                 seed,
                 checkpoints,
                 f"{key}-{label}-{i}",
-                rate,
-                near or label == "optima",
+                effort.rate,
+                effort.near or label == "optima",
             )
-            for i, batch in enumerate(_batches(values, model, records, together))
+            for i, batch in enumerate(_batches(values, model, records, effort.together))
         ]
         found = parallel_map(
             _optimise,
@@ -253,7 +268,7 @@ def maximise(
     first = best_first(climb(starts, short, "starts"))
     if steps <= short:
         return first
-    cut = max(1, round(kept * len(first)))
+    cut = max(1, round(effort.kept * len(first)))
     leading = first[:cut]
     further = climb([optimum.values for optimum in leading], steps - short, "optima")
     joined = [
