@@ -15,7 +15,7 @@ from pyro_dynogp.discrepancy.state import SearchState
 from pyro_dynogp.discrepancy.trials import without
 from pyro_dynogp.effects import CATALOGUE, Effect
 from pyro_dynogp.fitting import fit as fit_model
-from pyro_dynogp.inference.refit import family_of
+from pyro_dynogp.inference.refit import WARMUP, family_of
 from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.variants import used_channels
@@ -153,7 +153,8 @@ def _method_of(given: Fit, model: Model) -> dict[str, Any]:
     count = len(next(iter(given.draws.values())))
     if given.method == "nuts":
         chains = int(given.diagnostics["chains"])
-        return {"method": "nuts", "chains": chains, "draws": count // chains}
+        warmup = int(given.diagnostics.get("warmup", WARMUP))  # older files do not say
+        return {"method": "nuts", "chains": chains, "draws": count // chains, "warmup": warmup}
     if given.method == "svi":
         options: dict[str, Any] = {"method": "svi", "draws": count}
         if model.has_function == given.model.has_function and given.collapsed:

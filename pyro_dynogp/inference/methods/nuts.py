@@ -94,7 +94,8 @@ class Nuts:
             workers=run.workers,
             progress=run.progress,
         )
-        diagnostics = {"divergences": float(chain.divergences), "chains": float(self.chains)}
+        diagnostics = {"divergences": float(chain.divergences), "chains": float(self.chains),
+                       "warmup": float(self.warmup)}  # fmt: skip
         for site, values in chain.r_hat.items():
             diagnostics[f"r_hat {site}"] = float(values.max())
         for site, values in chain.effective_samples.items():
