@@ -300,7 +300,7 @@ class TestCascades:
     def test_layers_of_one_kind_have_dimensions_of_their_own(self):
         record = wiener_record()
         model = dgp.WienerHammerstein(1, pairs=(1, 2), inducing=5)
-        fit = dgp.fit(model, record, method="map", **{**FAST, "draws": None})
+        fit = dgp.fit(model, record, method="map", **{**FAST, "draws": None, "particles": None})
         data = fit.to_arviz(samples=2, prior_samples=2)
         posterior = data.posterior
         assert posterior["g1_decay_rate"].dims[2:] == ("g1_pair",)

@@ -57,7 +57,7 @@ def test_the_scaling_and_with_it_the_prior_stays(model, blank, monkeypatch):
         seen.append((model.scaled_to(record).scaling, record, options))
         raise RuntimeError("seen")
 
-    monkeypatch.setattr(simulation_based, "fit", fit)
+    monkeypatch.setattr(simulation_based, "train_model", fit)
     with pytest.raises(ValueError, match="replicates that all failed, the first with: RuntimeErr"):
         run(model, blank)
     assert [scaling == model.scaling for scaling, _, _ in seen] == [True] * 3

@@ -176,9 +176,7 @@ class TestRecords:
 class TestRepeatable:
     @pytest.mark.parametrize("guide", [None, "gauss-markov"])
     def test_seed_and_processes(self, guide, bent):
-        options = {**FAST, "guide": guide, "restarts": 2, "steps": 1}
-        if guide is None:
-            options["method"] = "map"
+        options = options_for(guide, restarts=2, steps=1)
         one = dgp.fit(wiener(), bent[:40], **options)
         workers = 1 if guide is None else 2
         assert same(one, dgp.fit(wiener(), bent[:40], **{**options, "workers": workers}))
