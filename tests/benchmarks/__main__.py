@@ -26,6 +26,7 @@ from tests.benchmarks import (
     reference,
     selection,
     speed,
+    thresholds,
     wiener,
 )
 from tests.benchmarks.paper import growth
@@ -45,6 +46,7 @@ PARTS = {
     "selection": selection.run,
     "brute_force": brute_force.run,
     "planted": planted.run,
+    "thresholds": thresholds.run,
     "measured": measured.run,
     "loop_cost": loop_cost.run,
     "paper": paper.run,
