@@ -60,10 +60,10 @@ def test_check_and_loo_agree_on_k(fit):
 
 def test_they_stay_with_their_fit(fit, tmp_path):
     draws_of(fit, count=100, anneal=False)
-    assert fit.__dict__[NAME]
+    assert fit.__dict__.get(NAME, {})
     assert NAME not in replace(fit).__dict__
-    assert not cloudpickle.loads(cloudpickle.dumps(fit)).__dict__[NAME]
-    assert not copy.deepcopy(fit.__dict__[NAME])
+    assert not cloudpickle.loads(cloudpickle.dumps(fit)).__dict__.get(NAME, {})
+    assert not copy.deepcopy(fit.__dict__.get(NAME, {}))
     subject = FitSubject(fit, fit.records, 100, 0)
     whole = len(cloudpickle.dumps(subject))
     assert len(subject.draws) == 100

@@ -7,8 +7,7 @@ import pytest
 
 from pyro_dynogp.statistics.interactions import COSINES, DELAYS, INPUTS, SINES, interactions
 from pyro_dynogp.statistics.omnibus import beyond_catalogue
-
-from .series import in_other_units, residuals, share
+from tests.discrepancy.series import in_other_units, residuals, share
 
 
 def spans(block, x):

@@ -7,8 +7,7 @@ from scipy.signal import lfilter
 from pyro_dynogp.statistics import bootstrap as sieve
 from pyro_dynogp.statistics.omnibus import beyond_catalogue, structure_left
 from pyro_dynogp.statistics.responses import responses
-
-from .series import check_rate, in_other_units, residuals, share
+from tests.discrepancy.series import check_rate, in_other_units, residuals, share
 
 
 def test_level_is_kept(monkeypatch):

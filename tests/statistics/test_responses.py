@@ -8,8 +8,7 @@ from scipy.signal import cont2discrete, lfilter
 from pyro_dynogp.data import signals
 from pyro_dynogp.statistics.responses import filtered, responses, time_constants
 from pyro_dynogp.statistics.shares_of_inputs import paths
-
-from .made import coloured, lag, residuals_of
+from tests.discrepancy.made import coloured, lag, residuals_of
 
 rng = np.random.default_rng(0)
 STEP = 0.1
