@@ -121,9 +121,9 @@ def elpd(method: str, target: str, kind: str = "linear", **options: Any) -> dict
     """Leave-one-out of a small fit."""
     if kind == "linear":
         record = drives()[:120]
-        given = {"steps": 200} if method == "svi" else {}
+        given = {"steps": 200, "draws": 400} if method == "svi" else {}
         model = dgp.LinearDynamicGP(inputs=1, pairs=1)
-        fit = dgp.fit(model, record, method=method, restarts=2, draws=400, **given, **QUICK)
+        fit = dgp.fit(model, record, method=method, restarts=2, **given, **QUICK)
     else:
         record = wiener_record(n=100)
         fit = dgp.fit(dgp.Wiener(1, pairs=1, inducing=6), record, restarts=2, steps=60, draws=200,
