@@ -12,6 +12,7 @@ import pytest
 import torch
 
 import pyro_dynogp as dgp
+from pyro_dynogp.effects import LevelShift
 
 
 def through_torch(value):
@@ -121,3 +122,40 @@ def test_a_mapping_of_a_record_is_read_only(record):
     kept = dgp.Record(record.time, outputs=record.outputs, extra={"room": record.time}).extra
     with pytest.raises(TypeError):
         kept["room"] = record.time
+
+
+@pytest.mark.parametrize("through", list(COPIES))
+def test_reports(through, small_report):
+    again = COPIES[through](small_report)
+    assert str(again) == str(small_report)
+    assert again.to_dict() == small_report.to_dict()
+    same_prediction(again.forecast_after, small_report.forecast_after)
+    assert all(torch.equal(again.fit.mode[k], v) for k, v in small_report.fit.mode.items())
+
+
+@pytest.fixture(scope="module")
+def small_report():
+    """A loop over a small record, in which a step is found."""
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.standard_normal(80), 6)
+    y = 0.5 * u + 0.05 * rng.standard_normal(480) + 0.5 * (np.arange(480) >= 300)
+    record = dgp.Record(np.arange(480.0), u, y)
+    model = dgp.LinearDynamicGP(1, pairs=1, process_noise=False)
+    quick = {"workers": 1, "progress": False}
+    fit = dgp.fit(model, record[:240], restarts=1, steps=40, **quick)
+    return dgp.close_loop(fit, record, effects=(LevelShift(),), max_rounds=1, **quick)
+
+
+def test_fits_of_every_method(record):
+    quick = {"restarts": 1, "steps": 2, "workers": 1, "progress": False}
+    nuts = dgp.fit(
+        dgp.LinearDynamicGP(1, pairs=1), record[:40], method=dgp.Nuts(2, warmup=2, draws=3), **quick
+    )
+    paths = dgp.fit(
+        dgp.Wiener(1, pairs=1, inducing=4), record[:40],
+        method=dgp.Trajectories(draws=3, particles=1), **quick,
+    )  # fmt: skip
+    for fit in (nuts, paths):
+        again = pickle.loads(pickle.dumps(fit))
+        same_fit(fit, again, record[:40], record[40:50])
+        assert list(again.trajectories) == list(fit.trajectories)

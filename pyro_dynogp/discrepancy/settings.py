@@ -25,8 +25,9 @@ class LoopSettings:
         harm: share of the mean absolute error of forecasts that an effect of the noise may cost.
             Evidence: reason: other weights of samples move a model a little.
         outside: how many times as much a cause outside the catalogue must explain before an effect
-            is doubted. Evidence: of 15 development plants with an effect of the catalogue it
-            explained at most 1.03 times as much, of 14 without one 9 more than twice.
+            is doubted. Evidence: counted once, by an earlier version whose rows are not kept: of 15
+            development plants with an effect of the catalogue it explained at most 1.03 times as
+            much, of 14 without one 9 more than twice.
         relative: largest p-value at which an effect is refitted because a relative's test rejects.
             Evidence: none.
         gate: share of `level` for each of the two answers to whether anything is left.
@@ -37,7 +38,7 @@ class LoopSettings:
             Evidence: convention.
         block_samples: fewest samples of the block that is searched and of the one reported on.
             Evidence: none.
-        measured_samples: fewest of them that were measured, and fewest that a test looks at.
+        measured_samples: fewest of them that were measured.
             Evidence: none.
         fit_share, search_share: shares of a record that is cut anew for the fit and the search.
             Evidence: none.

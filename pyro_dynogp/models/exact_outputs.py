@@ -50,6 +50,12 @@ class ExactOutputs(OutputProcess):
     record, other systems in scaled units.
     """
 
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        # Made at once, so that gradients of several records add up in the order of the records.
+        if self._physical:
+            _ = self.process
+
     @property
     def has_rsample(self) -> bool:  # type: ignore[override]
         """Whether draws have gradients: those of one linear layer."""

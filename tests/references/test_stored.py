@@ -1,0 +1,48 @@
+"""The log joint of linear models at stored modes is what the version before the one model computed."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+import pyro_dynogp as dgp
+from pyro_dynogp.inference.density import Potential
+from tests.references.cases import drives, furnace, two_outputs
+
+STORED = json.loads((Path(__file__).parent / "values.json").read_text())
+MODELS = {
+    "linear, drives": (lambda: dgp.LinearDynamicGP(1, pairs=2), lambda: drives()[:240]),
+    "linear, furnace": (lambda: dgp.LinearDynamicGP(1, pairs=2), furnace),
+    "linear, furnace, no process noise": (
+        lambda: dgp.LinearDynamicGP(1, pairs=2, process_noise=False), furnace,
+    ),
+    "linear, furnace, first state zero": (
+        lambda: dgp.LinearDynamicGP(1, pairs=2, initial_state="zero"), furnace,
+    ),
+    "linear, furnace, no feedthrough": (
+        lambda: dgp.LinearDynamicGP(1, pairs=2, feedthrough=False), furnace,
+    ),
+    "linear, two outputs": (lambda: dgp.LinearDynamicGP(1, outputs=2, pairs=1), two_outputs),
+    "linear, two records": (
+        lambda: dgp.LinearDynamicGP(1, pairs=2), lambda: (drives()[:100], drives()[120:260]),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_log_joint_at_the_stored_mode(name):
+    stored = STORED["fits"][name]
+    make, records = MODELS[name]
+    model, records = make(), records()
+    prepared = model.check(records)
+    scaled = model.scaled_to(prepared).collapsed
+    sites = scaled.all_sites(scaled.scaling, len(prepared))
+    assert {site.name for site in sites} == set(stored["mode"])
+    values = {
+        site.name: torch.tensor(stored["mode"][site.name]).double().reshape(site.shape)
+        for site in sites
+    }
+    argument = prepared[0] if len(prepared) == 1 else prepared
+    found = float(Potential(scaled, (argument,), values).log_joint(values))
+    assert found == pytest.approx(stored["log_joint"], rel=1e-9)
