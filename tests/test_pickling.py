@@ -149,7 +149,7 @@ def small_report():
 def test_fits_of_every_method(record):
     quick = {"restarts": 1, "steps": 2, "workers": 1, "progress": False}
     nuts = dgp.fit(
-        dgp.LinearDynamicGP(1, pairs=1), record[:40], method=dgp.Nuts(2, warmup=2, draws=3), **quick
+        dgp.LinearDynamicGP(1, pairs=1), record[:40], method=dgp.Nuts(2, warmup=2, draws=4), **quick
     )
     paths = dgp.fit(
         dgp.Wiener(1, pairs=1, inducing=4), record[:40],

@@ -13,17 +13,20 @@ class LoopSettings:
 
     Attributes:
         gain: least gain of held-out log density by which an effect is added [nats].
-            Evidence: convention of cross-validation.
+            Evidence: convention of cross-validation; half and double of it judge none of 66
+            stored refits otherwise (docs/measurements.md).
         standard_errors: block standard errors that such a gain must exceed.
             Evidence: coverage of the error under autocorrelation is measured in the tests of
-            `criticism.comparison`.
+            `criticism.comparison`; 1 and 3 judge 8 and 6 of 66 stored refits otherwise.
         cap: most that one sample counts for where the plain sum is not certain [nats].
-            Evidence: reason: an outlier makes the standard error as large as the sum; re-judged
-            with half and double of it, see docs/measurements.md.
+            Evidence: reason: an outlier makes the standard error as large as the sum; half and
+            double of it judge none of 66 stored refits otherwise.
         special: share of a gain that a special case of an effect may lack and still be named.
-            Evidence: reason: what is left are differences of fits.
+            Evidence: reason: what is left are differences of fits; half and double of it name
+            the same effect for all 66 stored refits.
         harm: share of the mean absolute error of forecasts that an effect of the noise may cost.
-            Evidence: reason: other weights of samples move a model a little.
+            Evidence: reason: other weights of samples move a model a little; half and double of
+            it judge none of 66 stored refits otherwise.
         outside: how many times as much a cause outside the catalogue must explain before an effect
             is doubted. Evidence: counted once, by an earlier version whose rows are not kept: of 15
             development plants with an effect of the catalogue it explained at most 1.03 times as

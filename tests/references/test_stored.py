@@ -1,4 +1,4 @@
-"""The log joint of linear models at stored modes is what the version before the one model computed."""
+"""Log joints of linear models at stored modes are those of the version before the one model."""
 
 import json
 from pathlib import Path
