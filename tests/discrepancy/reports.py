@@ -3,9 +3,9 @@
 from types import SimpleNamespace
 
 import numpy as np
-from pyro_dynogp.discrepancy.result import Attempt, FoundEffect
 
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.discrepancy.result import Attempt, FoundEffect
 from pyro_dynogp.models.description import Part
 from pyro_dynogp.prediction.prediction import Prediction
 from pyro_dynogp.report.report import Report
