@@ -22,7 +22,8 @@ def site_dimensions(
     model: Model, scaling: Scaling, records: Sequence[Record]
 ) -> dict[str, tuple[str, ...]]:
     """Names of the dimensions of each site of a model, and of its trajectories."""
-    explicit = replace(model, integrate="none")  # with what is drawn beside the parameters
+    # With what is drawn beside the parameters.
+    explicit = model if model.has_feedback else replace(model, integrate="none")
     out = {site.name: site.dims for site in explicit.all_sites(scaling, len(records))}
     for wire in model.wires:
         several = (wire.dims["output"],) if wire.layer.outputs > 1 else ()
@@ -52,13 +53,16 @@ def labels_of(model: Model, scaling: Scaling, records: Sequence[Record]) -> dict
             labels[f"{dim}_unit"] = (dim, np.array(units), {})
     signals = {INPUTS: scaling.input_names}
     for wire in model.wires:
-        seen = tuple(label for source in wire.sources for label in signals[source])
-        if wire.sources != (INPUTS,) and seen:
-            dim = wire.dims["input"]
-            labels[dim] = (dim, np.array(seen), {})
         width = wire.layer.outputs
         several = tuple(f"{wire.name}[{a}]" for a in range(width))
         signals[wire.name] = several if width > 1 else (wire.name,)
+    for wire in model.wires:
+        seen = tuple(label for source in wire.sources for label in signals[source])
+        fed = tuple(label for source in wire.feedback for label in signals[source])
+        for role, names in (("direct", seen), ("input", seen + fed)):
+            dim = wire.dims[role]
+            if dim != "input" and names:
+                labels[dim] = (dim, np.array(names), {})
     for suffix, record in zip(suffixes_of(records), records, strict=True):
         labels |= clock_of(record, f"time{suffix}")
     return labels

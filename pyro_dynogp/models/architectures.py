@@ -62,11 +62,14 @@ def Cascade(
         inputs: n_u, may be 0; those that channels make included.
         layers: `Dynamic` and `Static` layers, first to last.
         likelihood: `Gaussian()` by default, `StudentT(...)` or `Heteroscedastic(...)`.
-        options: of `Model`: initial_state, integrate, priors, direct, channels, scaling.
+        options: of `Model`: initial_state, integrate ("all" with feedback), priors, direct,
+            channels, scaling, output.
 
     Raises:
         ValueError: on layers that do not fit together, or unknown options.
     """
+    if any(isinstance(layer, Dynamic) and layer.feedback for layer in layers):
+        options = {"integrate": "all", **options}
     return Model(inputs, tuple(layers), likelihood or Gaussian(), **options)
 
 

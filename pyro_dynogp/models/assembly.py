@@ -4,7 +4,8 @@ A signal is the sum of a known part, what the recorded inputs would cause by the
 over the joint vector a = [x; f] of all modal states and all random static outputs. Known parts pass
 through the exact mean response; only the rest is filtered. A dynamic layer that sees a trajectory
 directly (skip connections, two dynamic layers in a row) does so through an identity function, for
-which moment matching is exact.
+which moment matching is exact. A static output that comes back to an earlier dynamic layer is held
+until the next sample, as any other that a dynamic layer sees; its known part is nothing.
 """
 
 from __future__ import annotations
@@ -54,11 +55,13 @@ class Assembly:
         signals: every layer's output, by name.
         known_state: (*b, N) real state of all dynamic layers at the last sample that known inputs
             cause, ordered as the filter's.
+        blocks: static functions of the problem, in its order.
     """
 
     problem: FilterProblem
     signals: dict[str, Signal]
     known_state: Tensor
+    blocks: tuple[Block, ...]
 
     def with_outputs(self, y: Tensor) -> FilterProblem:
         """The problem with scaled outputs y (*b, n, n_y), NaN where missing."""
@@ -71,9 +74,13 @@ def count_states(system: System) -> int:
     return sum(2 * one.modes.pairs for one in layers if isinstance(one, DynamicSystem))
 
 
-def count_outputs(wires: Sequence[Wire]) -> int:
-    """E, the random static outputs, identities included."""
+def places_of_outputs(wires: Sequence[Wire]) -> tuple[dict[str, int], int]:
+    """First place of each static layer among the random static outputs, and E, how many there are.
+
+    Identities count.
+    """
     random: dict[str, str] = {INPUTS: "known"}
+    first: dict[str, int] = {}
     total = 0
     for one in wires:
         sources = [random[name] for name in one.sources]
@@ -81,11 +88,12 @@ def count_outputs(wires: Sequence[Wire]) -> int:
             total += one.channels if "trajectory" in sources else 0
             random[one.name] = "trajectory"
         elif any(kind != "known" for kind in sources):
+            first[one.name] = total
             total += one.layer.outputs
             random[one.name] = "function"
         else:
             random[one.name] = "known"
-    return total
+    return first, total
 
 
 class _Assembler:
@@ -95,7 +103,8 @@ class _Assembler:
         self.system, self.grid = system, grid
         self.batch = system.batch_shape
         self.states = count_states(system)
-        self.total = self.states + count_outputs(system.wires)
+        self.first_output, outputs = places_of_outputs(system.wires)
+        self.total = self.states + outputs
         driving = system.driving(inputs)
         self.level = system.level(inputs)
         self.signals = {INPUTS: Signal(driving, None, (KNOWN,) * driving.shape[-1])}
@@ -158,16 +167,17 @@ class _Assembler:
             seen = Signal(held.known, held.rows, held.outputs)
             known = held.known
         modes = layer.modes
-        responded = mean_response(
-            modes, self.grid, known if modes.inputs else None, layer.first_state
-        )
+        if one.fed:
+            known = torch.cat([known, known.new_zeros((*known.shape[:-1], one.fed))], -1)
+        driven = known if modes.inputs else None
+        responded = mean_response(modes, self.grid, driven, layer.first_state)
         response = responded.output
         response = response if modes.several_outputs else response.unsqueeze(-1)
         self.last_states.append(self.expand(responded.state, 1))
         gain = propagators(modes, self.grid.steps)[1].unsqueeze(-1) * modes.B.unsqueeze(-3)
         E = self.total - self.states
         select = torch.zeros(modes.inputs, E, dtype=torch.complex128)
-        for i, o in enumerate(seen.outputs):
+        for i, o in enumerate((*seen.outputs, *self.fed_back(one))):
             if o >= 0:
                 select[i, o] = 1.0
         self.gains.append(self.expand(gain @ select, 3))
@@ -177,9 +187,14 @@ class _Assembler:
         self.covariances.append(covariance)
         rows = self.state_rows(modes)
         if seen.rows is not None:
-            rows = rows + modes.D @ seen.rows
+            rows = rows + modes.D[..., : one.channels] @ seen.rows
         self.pairs_before += modes.pairs
         return Signal(self.expand(response, 2), rows, (TRAJECTORY,) * modes.outputs)
+
+    def fed_back(self, one: Wire) -> list[int]:
+        """Static outputs that come back to a dynamic layer."""
+        width = {w.name: w.layer.outputs for w in self.system.wires}
+        return [self.first_output[name] + a for name in one.feedback for a in range(width[name])]
 
     def state_rows(self, modes: Modes) -> Tensor:
         C = self.expand(modes.C, 2)
@@ -205,8 +220,10 @@ class _Assembler:
         return out
 
     def function_is_measured(self, output: Signal) -> bool:
-        """Whether the only output is a tabulated function of one signal."""
+        """Whether the only output is a tabulated function of one signal, of no other effect."""
         if output.rows is None or output.outputs != (self.outputs_before - 1,):
+            return False
+        if self.system.output[0].pathwise:
             return False
         last = self.blocks[-1]
         return last.function is not None and last.channels == last.outputs == 1
@@ -219,7 +236,7 @@ class _Assembler:
         joined = torch.cat(phi, -1) if phi else nothing
         E = self.total - self.states
         gains = torch.cat(self.gains, -2) if self.gains else nothing.new_zeros((m, 0, E))
-        output = self.signals[self.system.wires[-1].name]
+        output = self.signals[self.system.output[0].name]
         n, n_y = len(self.grid), output.known.shape[-1]
         offset = output.known
         if self.level is not None:
@@ -262,7 +279,8 @@ class _Assembler:
             **values,
         )
         known = torch.cat(self.last_states, -1) if self.last_states else nothing[..., 0, :0]
-        return Assembly(problem, self.signals, torch.cat([known.real, known.imag], -1))
+        known_state = torch.cat([known.real, known.imag], -1)
+        return Assembly(problem, self.signals, known_state, tuple(blocks))
 
 
 def assemble(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from pyro_dynogp.data.channels import Channel, count_direct, prepared
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.records import as_records
+from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
@@ -49,4 +50,26 @@ def check_direct(inputs: int, direct: int, channels: Sequence[Channel]) -> None:
     if not isinstance(direct, int) or not least <= direct <= inputs:
         raise invalid(
             "direct", expected=f"a whole number from {least} to {inputs}", got=repr(direct)
+        )
+
+
+def check_feedback(integrate: str, likelihood: Likelihood) -> None:
+    """Whether a model with feedback can do with these options.
+
+    Raises:
+        ValueError: on trajectories as sites, or noise that varies with the output.
+    """
+    if integrate != "all":
+        raise invalid(
+            "integrate",
+            expected="'all' for a model with feedback, whose trajectories depend on each other "
+            "sample by sample and cannot be sample sites",
+            got=repr(integrate),
+        )
+    if likelihood.varying and likelihood.of == "output":
+        raise invalid(
+            "likelihood",
+            expected="noise of constant size, or one that varies with the inputs, for a model with "
+            "feedback",
+            got=repr(likelihood),
         )

@@ -39,6 +39,8 @@ def has_exact_density(system: System) -> bool:
 
     The last layer may have process noise and an unknown first state where it is dynamic.
     """
+    if system.has_feedback:
+        return False
     lower = [layer for layer in system.layers[:-1] if isinstance(layer, DynamicSystem)]
     return all(layer.is_known for layer in lower) and system.noise.likelihood.gaussian
 

@@ -102,7 +102,12 @@ def _function(block: Block, M: int, widest: int) -> tuple[int, dict[str, Tensor]
         return KERNELS["rbf"], values
     if d == 1:
         low, high = table_range(function)
-        mean, variance = function.moments(even_grid(low, high, GRID).unsqueeze(-1))
+        grid = even_grid(low, high, GRID).unsqueeze(-1)
+        mean, variance = function.moments(grid)
+        if function.slope is not None and not block.with_variance:
+            # The line is no part of the table, so that it goes on beyond it.
+            values["slope"] = torch.nn.functional.pad(function.slope, (0, widest - 1))
+            mean = mean - grid @ function.slope.mT
         values["table_mean"] = mean.mT
         if block.with_variance:
             values["table_variance"] = variance.mT

@@ -18,7 +18,7 @@ from pyro_dynogp.layers.functions import StaticFunction, support_points
 from pyro_dynogp.layers.noise import Gaussian, Likelihood
 from pyro_dynogp.layers.sites import Site, Values, sample
 from pyro_dynogp.layers.static import StaticPrior
-from pyro_dynogp.models.checks import check_direct, check_records, prepare
+from pyro_dynogp.models.checks import check_direct, check_feedback, check_records, prepare
 from pyro_dynogp.models.explicit import observe_explicit
 from pyro_dynogp.models.limits import at_limits, count_as_probabilities, scaled_limits
 from pyro_dynogp.models.outputs import output_process
@@ -76,6 +76,8 @@ class Model:
             normal(0, 1) in standard deviations.
         channels: made from each record before the model sees it, see `pyro_dynogp.data.channels`.
         scaling: learnt by `fit` from the training record; else from the record at hand.
+        output: name of the layer whose output is measured, where it is not the last. With feedback
+            trajectories are always integrated out (``integrate="all"``).
 
     Raises:
         ValueError: on layers that do not fit together, or unknown options.
@@ -93,6 +95,7 @@ class Model:
     direct: int = 0
     channels: tuple[Channel, ...] = ()
     scaling: Scaling | None = None
+    output: str | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.inputs, int) or self.inputs < 0:
@@ -115,8 +118,11 @@ class Model:
                 expected = f"{', '.join(most)} or {last}"
                 raise invalid(name, expected=expected, got=repr(getattr(self, name)))
         check_direct(self.inputs, self.direct, self.channels)
-        object.__setattr__(self, "_wires", wire(self.inputs - self.direct, self.layers))
-        end = self.layers[-1]
+        wires = wire(self.inputs - self.direct, self.layers, self.output)
+        object.__setattr__(self, "_wires", wires)
+        if self.has_feedback:
+            check_feedback(self.integrate, self.likelihood)
+        end = self.output_wire.layer
         if self.integrate == "last" and not (
             isinstance(end, Dynamic) and self.likelihood == Gaussian() and not self.direct
         ):
@@ -134,9 +140,19 @@ class Model:
         return wires
 
     @property
+    def output_wire(self) -> Wire:
+        """The layer whose output is measured, in its place."""
+        return next(w for w in self.wires if w.last)
+
+    @property
+    def has_feedback(self) -> bool:
+        """Whether a static layer's output comes back to an earlier layer."""
+        return any(w.feedback for w in self.wires)
+
+    @property
     def outputs(self) -> int:
-        """n_y, the width of the last layer."""
-        return self.layers[-1].outputs
+        """n_y, the width of the layer that is measured."""
+        return self.output_wire.layer.outputs
 
     @property
     def several_outputs(self) -> bool:
@@ -167,13 +183,13 @@ class Model:
             if any(isinstance(w.layer, Static) for w in self.wires[place:])
             for name in reader.sources
         }
-        return tuple(w for w, _ in self.dynamic if w.channels and w.name in names)
+        return tuple(w for w, _ in self.dynamic if w.channels + w.fed and w.name in names)
 
     @property
     def state_sites(self) -> tuple[Wire, ...]:
         """Dynamic layers whose first state is a site."""
         if self.initial_state == "site":
-            return tuple(w for w, _ in self.dynamic if w.channels)
+            return tuple(w for w, _ in self.dynamic if w.channels + w.fed)
         return self.seen_by_functions if self.initial_state == "auto" else ()
 
     @property
@@ -215,7 +231,7 @@ class Model:
                     yield Site(f"{w.name}_residual", prior, dims, role="free")
         if self.direct:
             yield direct_site(self.direct, self.outputs, flat=flat)
-        if isinstance(self.layers[-1], Dynamic):
+        if isinstance(self.output_wire.layer, Dynamic):
             zero = torch.zeros(self.outputs, dtype=torch.float64)
             prior = dist.Normal(zero, zero + (FLAT if flat else 1.0)).to_event(1)
             yield Site("offset", prior, ("output",))
@@ -296,7 +312,7 @@ class Model:
     def _modes_prior(self, place: Wire, layer: Dynamic, time_scale: TimeScale) -> ModesPrior:
         return ModesPrior(
             place.name,
-            inputs=place.channels,
+            inputs=place.channels + place.fed,
             pairs=layer.pairs,
             outputs=layer.outputs if layer.outputs > 1 else None,
             brownian=layer.brownian or layer.outputs,
@@ -305,10 +321,10 @@ class Model:
             process_noise=layer.process_noise,
             time_scale=time_scale,
             priors=self.priors,
+            fed=place.fed,
         )
 
-    @staticmethod
-    def _static_prior(place: Wire, layer: Static) -> StaticPrior:
+    def _static_prior(self, place: Wire, layer: Static) -> StaticPrior:
         return StaticPrior(
             place.name,
             channels=place.channels,
@@ -317,6 +333,7 @@ class Model:
             kernel=layer.kernel,
             mean=layer.mean or "constant",
             learn_locations=layer.learn_locations,
+            identity=not any(place.name in w.feedback for w in self.wires),
         )
 
     def _has_residual(self, place: Wire) -> bool:

@@ -176,6 +176,7 @@ class ModesPrior:
         brownian: n_l, number of Brownian motions (for each pair, if independent).
         noise: "shared" or "independent", see `Modes`.
         feedthrough: whether there is a direct path D.
+        fed: how many of the inputs, the last ones, come back and have no direct path.
         process_noise: whether there is process noise at all.
         time_scale: step and duration of the record [s].
         gain_scale: of the gains of an input a priori.
@@ -196,6 +197,7 @@ class ModesPrior:
     time_scale: TimeScale = TimeScale(1.0, 1000.0)
     gain_scale: float = GAIN_SCALE
     priors: PriorName = "default"
+    fed: int = 0
 
     def __post_init__(self) -> None:
         if self.priors not in ("default", "paper"):
@@ -209,7 +211,8 @@ class ModesPrior:
         """The sites, in the order in which they are sampled.
 
         Args:
-            dims: names of dimensions ("pair", "input", "output", "brownian") where they are others.
+            dims: names of dimensions ("pair", "input", "output", "brownian", and "direct", inputs
+                with a direct path) where they are others.
         """
 
         def named(*generic: str) -> tuple[str, ...]:
@@ -226,9 +229,11 @@ class ModesPrior:
             )
             over = named("pair", "input", "term")
             sites.append(Site(f"{name}_input_gain", gain, over, growth=0.0))
-            if self.feedthrough:
-                shape = (n_u,) if self.outputs is None else (self.outputs, n_u)
-                over = named("input") if self.outputs is None else named("output", "input")
+            if self.feedthrough and n_u > self.fed:
+                direct_inputs = n_u - self.fed
+                shape = (direct_inputs,) if self.outputs is None else (self.outputs, direct_inputs)
+                across = dims.get("direct", dims.get("input", "input"))
+                over = (across,) if self.outputs is None else (*named("output"), across)
                 direct = _normal(FLAT if flat else 1.0, *shape)
                 sites.append(Site(f"{name}_feedthrough", direct, over, growth=0.0))
         if self.process_noise:
@@ -284,6 +289,8 @@ class ModesPrior:
         else:
             c = unit_direction(_complex(values[f"{name}_output_gain"]))
         D = values.get(f"{name}_feedthrough")
+        if D is not None and self.fed:
+            D = torch.nn.functional.pad(D, (0, self.fed))
         return Modes(
             poles=poles, input_gain=B, output_gain=c, noise_gain=L, feedthrough=D, noise=self.noise
         )

@@ -219,6 +219,16 @@ class System:
         return tuple((wire, layer) for wire, layer in pairs if isinstance(layer, DynamicSystem))
 
     @property
+    def output(self) -> tuple[Wire, DynamicSystem | StaticSystem]:
+        """The layer whose output is the model's, with its place."""
+        return next(p for p in zip(self.wires, self.layers, strict=True) if p[0].last)
+
+    @property
+    def has_feedback(self) -> bool:
+        """Whether a static layer's output comes back to an earlier layer."""
+        return any(wire.feedback for wire in self.wires)
+
+    @property
     def is_linear(self) -> bool:
         """Whether it is one layer of linear dynamics, whatever the noise."""
         return len(self.layers) == 1 and isinstance(self.layers[0], DynamicSystem)

@@ -26,6 +26,9 @@ class Dynamic:
         process_noise: whether there is any.
         skip: names of earlier signals ("inputs", or layers) that the layer sees beside the
             output of the layer before it.
+        feedback: names of later static layers whose outputs are further inputs of this layer. Each
+            acts from the sample after the one that it is computed at, and never on the output at
+            once: the loop has a delay.
         name: prefix of its sites; g, or g1, g2, ... by default.
     """
 
@@ -36,6 +39,7 @@ class Dynamic:
     feedthrough: bool = True
     process_noise: bool = True
     skip: tuple[str, ...] = ()
+    feedback: tuple[str, ...] = ()
     name: str | None = None
 
 
@@ -46,8 +50,8 @@ class Static:
     Args:
         outputs: width of the layer. inducing: number of inducing values for each output.
         kernel: a gpytorch kernel; Matern-3/2 with a lengthscale for each channel by default.
-        mean: "linear" or "constant" prior mean; by default linear for a first layer and where
-            there are limits, else constant. Beyond the data a function goes back to it.
+        mean: "linear" or "constant" prior mean; by default linear for a first layer, in feedback
+            and where there are limits, else constant. Beyond the data a function goes back to it.
         limits: lowest and highest value of the linear mean [output], None for none: those of a
             sensor that stops. Of a last layer of one signal and one output.
         skip: names of earlier signals that the layer sees too.
@@ -79,7 +83,8 @@ class Wire:
         name: of the layer. layer: its specification, nothing left to default.
         sources: names of the signals it sees, in order. channels: how many they are.
         pathwise: whether a dynamic layer sees its output, directly or through static layers.
-        last: whether it is the last. single: whether no other layer is of its kind.
+        last: whether its output is the model's. single: whether no other layer is of its kind.
+        fed: number of channels that come back from the layers in `feedback`, after the others.
     """
 
     name: str
@@ -89,6 +94,12 @@ class Wire:
     pathwise: bool
     last: bool
     single: bool = True
+    fed: int = 0
+
+    @property
+    def feedback(self) -> tuple[str, ...]:
+        """Names of the static layers whose outputs come back to this layer."""
+        return self.layer.feedback if isinstance(self.layer, Dynamic) else ()
 
     @property
     def dims(self) -> dict[str, str]:
@@ -97,8 +108,10 @@ class Wire:
         Inputs and outputs of the model are "input" and "output"; dimensions that another layer of
         the kind has with another length carry the layer's name.
         """
+        own, first = f"{self.name}_input", self.sources == (INPUTS,)
         names = {
-            "input": "input" if self.sources == (INPUTS,) else f"{self.name}_input",
+            "input": "input" if first and not self.fed else own,
+            "direct": "input" if first else f"{self.name}_forward" if self.fed else own,
             "output": "output" if self.last else f"{self.name}_output",
         }
         for dim in ("pair", "brownian", "state", "inducing", "support"):
@@ -112,15 +125,26 @@ class Wire:
         return f"{kind} layer {self.name}"
 
 
-def wire(inputs: int, layers: Sequence[Layer]) -> tuple[Wire, ...]:
+def wire(inputs: int, layers: Sequence[Layer], output: str | None = None) -> tuple[Wire, ...]:
     """Name the layers, count their channels and say what each feeds.
 
+    Args:
+        inputs: number of inputs. layers: first to last. output: name of the layer whose output is
+            the model's; None for the last.
+
     Raises:
-        ValueError: for no layers, names that repeat, skips that point nowhere or forward.
+        ValueError: for no layers, names that repeat, skips that point nowhere or forward, feedback
+            that comes from anything but a later static layer, and layers that lead nowhere.
     """
     if not layers:
         raise invalid("layers", expected="at least one layer", got="none")
     names = _names(layers)
+    output = names[-1] if output is None else output
+    if output not in names:
+        raise invalid("output", expected=f"one of the layers {names}", got=repr(output))
+    _check_feedback(names, layers)
+    widths = {name: layer.outputs for name, layer in zip(names, layers, strict=True)}
+    back = {source for layer in layers if isinstance(layer, Dynamic) for source in layer.feedback}
     width = {INPUTS: inputs}
     wires: list[Wire] = []
     before: str = INPUTS
@@ -140,22 +164,24 @@ def wire(inputs: int, layers: Sequence[Layer]) -> tuple[Wire, ...]:
                 raise invalid(
                     f"layer {name!r}", expected="inputs for a static layer", got="no channels"
                 )
-            linear = place == 0 or layer.limits is not None
+            linear = place == 0 or name in back or layer.limits is not None
             layer = replace(layer, mean=layer.mean or ("linear" if linear else "constant"))
             if layer.limits is not None:
-                _check_limits(name, layer, channels, place == len(layers) - 1)
-        elif channels == 0 and not layer.process_noise:
+                _check_limits(name, layer, channels, name == output and name not in back)
+        elif channels == 0 and not (layer.process_noise or layer.feedback):
             raise invalid(
                 f"process_noise of layer {name!r}",
                 expected="True for a layer without inputs",
                 got="False",
             )
-        last = place == len(layers) - 1
+        last = name == output
+        fed = sum(widths[source] for source in getattr(layer, "feedback", ()))
         single = sum(type(other) is type(layer) for other in layers) == 1
-        wires.append(Wire(name, layer, sources, channels, False, last, single))
+        wires.append(Wire(name, layer, sources, channels, False, last, single, fed))
         width[name] = layer.outputs
         before = name
-    feeds: set[str] = set()
+    _check_that_all_matter(wires, output)
+    feeds = set(back)
     for place in range(len(wires) - 1, -1, -1):
         here = wires[place]
         pathwise = here.name in feeds
@@ -184,6 +210,38 @@ def _names(layers: Sequence[Layer]) -> list[str]:
             got=str(names),
         )
     return names
+
+
+def _check_feedback(names: Sequence[str], layers: Sequence[Layer]) -> None:
+    for place, layer in enumerate(layers):
+        if not isinstance(layer, Dynamic):
+            continue
+        later = [n for n, other in zip(names, layers, strict=True) if isinstance(other, Static)]
+        later = [n for n in later if names.index(n) > place]
+        given = layer.feedback
+        if isinstance(given, str) or len(set(given)) < len(given) or not set(given) <= set(later):
+            raise invalid(
+                f"feedback of layer {names[place]!r}",
+                expected=f"a tuple of names of later static layers, of {later}",
+                got=repr(given),
+                advice="Earlier signals come by skip; a loop without a static layer is linear.",
+            )
+
+
+def _check_that_all_matter(wires: Sequence[Wire], output: str) -> None:
+    """Refuse layers that lead neither to the output nor back to a layer that does."""
+    matter: set[str] = set()
+    new = {output}
+    while new:
+        matter |= new
+        new = {s for w in wires if w.name in new for s in (*w.sources, *w.feedback)} - matter
+    idle = [w.name for w in wires if w.name not in matter]
+    if idle:
+        raise invalid(
+            "layers",
+            expected=f"layers that lead to the output {output!r}, or back to one that does",
+            got=f"{idle} without effect on it",
+        )
 
 
 def _check_layer(name: str, layer: Layer) -> None:
@@ -224,7 +282,7 @@ def _check_limits(name: str, layer: Static, channels: int, last: bool) -> None:
     if not last or layer.mean != "linear" or (channels, layer.outputs) != (1, 1):
         raise invalid(
             f"limits of layer {name!r}",
-            expected="a last layer with a linear mean, of one signal and one output",
+            expected="a last layer with a linear mean, of one signal, one output, not fed back",
             got=f"mean {layer.mean!r}, {channels} signals, {layer.outputs} outputs"
-            + ("" if last else ", not the last layer"),
+            + ("" if last else ", not the last layer, or fed back"),
         )

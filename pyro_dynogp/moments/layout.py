@@ -53,7 +53,7 @@ class Values(NamedTuple):
         table_mean, table_variance: (E, grid) of tabulated functions.
         low, spacing: (S,) first point and spacing of the grid.
         weight: (E, M), Z: (S, M, d_max), inverse: (S, d_max), constant: (E,), slope: (E, d_max):
-            of radial expansions.
+            of radial expansions; slope also of the line beside a table (not of a measured one).
         H: (n_y, A) rows of the outputs. y_offset: (n, n_y) their known part.
         y: (n, n_y) measured, NaN where missing. R: (n, n_y) variance of the noise.
     """

@@ -141,7 +141,7 @@ def _average(i, layout, values, mean, block, work):
         if layout.form[i] == TABLE:
             k = locate(z[0], values.low[i], values.spacing[i], grid, weight4, slope4)
             for a in range(e):
-                total = 0.0
+                total = values.slope[f0 + a, 0] * z[0]
                 variance = 0.0
                 for b in range(4):
                     total += weight4[b] * values.table_mean[f0 + a, k + b]
@@ -241,8 +241,11 @@ def _average_adjoint(i, layout, values, bars, m, m_bar, P_bar, work):
             f_bar[a] = wq * total
         if layout.form[i] == TABLE:
             k = locate(z[0], values.low[i], values.spacing[i], grid, w4, s4)
+            line_bar = 0.0
             for a in range(e):
                 v_bar = wq * P_bar[na + a, na + a]
+                bars.slope[f0 + a, 0] += f_bar[a] * z[0]
+                line_bar += f_bar[a] * values.slope[f0 + a, 0]
                 for b in range(4):
                     bars.table_mean[f0 + a, k + b] += f_bar[a] * w4[b]
                     bars.table_variance[f0 + a, k + b] += v_bar * w4[b]
@@ -253,6 +256,7 @@ def _average_adjoint(i, layout, values, bars, m, m_bar, P_bar, work):
             # The grid itself may move: f depends on (z - low) / spacing.
             bars.low[i] -= z_bar[0]
             bars.spacing[i] -= z_bar[0] * (z[0] - values.low[i]) / values.spacing[i]
+            z_bar[0] += line_bar
         else:
             part, part_bar = _expansion(i, layout, values), _expansion(i, layout, bars)
             expansion_adjoint(layout.form[i], z[:d], part, f_bar, z_bar[:d], part_bar)

@@ -1,0 +1,108 @@
+"""Models with feedback, and the linear system that a linear function in feedback makes, densely."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+import pyro_dynogp as dgp
+from pyro_dynogp.layers.sites import sample
+from pyro_dynogp.models.wiring import Dynamic, Static
+
+
+def spring(outputs=1, pairs=2, inputs=1, process_noise=True, **options):
+    """A layer g whose output comes back through a function f of all of it."""
+    layers = (
+        Dynamic(outputs=outputs, pairs=pairs, process_noise=process_noise, feedback=("f",)),
+        Static(outputs=outputs, inducing=6),
+    )
+    return dgp.Cascade(inputs, layers, output="g", **options)
+
+
+def make_record(inputs=1, outputs=1, n=40, seed=0, irregular=False, missing=True):
+    rng = np.random.default_rng(seed)
+    step = rng.choice([0.05, 0.1, 0.17], n) if irregular else np.full(n, 0.1)
+    y = 2.0 + 0.5 * np.cumsum(rng.standard_normal((n, outputs)), 0)
+    if missing:
+        y[[3, 8]] = np.nan
+        y[11, -1] = np.nan
+    u = np.repeat(rng.standard_normal((n // 3 + 1, inputs)), 3, axis=0)[:n]
+    return dgp.Record(time=np.cumsum(step), inputs=u, outputs=y)
+
+
+def values_of(model, record, seed=0, linear=True):
+    """Values of all sites at random; with `linear` those of a straight line for f."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        values = sample(model.all_sites(model.scaling, 1))
+    values["noise_sd"] = values["noise_sd"].clamp(0.05, 1.0)
+    values["g_input_gain"] = 0.4 * torch.tanh(values["g_input_gain"])
+    if linear:
+        values["f_values"] = torch.zeros_like(values["f_values"])
+    return values
+
+
+def system_at(model, values):
+    states = {w.name: values[f"{w.name}_initial_state"] for w in model.state_sites}
+    return model.begin(model.system(values, model.scaling), states)
+
+
+class ClosedLoop:
+    """x[k + 1] = F_k x[k] + drive_k + N(0, Q_k), y = H x + level_k + noise, complex modal states.
+
+    Everything from poles and gains, in numpy; outputs scaled.
+    """
+
+    def __init__(self, model, system, record):
+        layer, function = system.layer("g"), system.layer("f").function
+        modes, scaling = layer.modes, model.scaling
+        P = modes.pairs
+        lam = np.concatenate([modes.poles.numpy(), modes.poles.numpy().conj()])
+        B = np.concatenate([modes.B.numpy(), modes.B.numpy().conj()])
+        self.H = np.concatenate([modes.C.numpy(), modes.C.numpy().conj()], -1)
+        d = model.inputs
+        u = (record.inputs - scaling.input_offset) / scaling.input_scale
+        slope, constant = function.slope.numpy(), function.constant.numpy()
+        D = modes.D.numpy()[:, :d]
+        self.level = u @ D.T + system.offset.numpy()
+        self.F, self.drive, self.Q = [], [], []
+        L = np.zeros((2 * P, 1))
+        if modes.has_process_noise:
+            L = np.concatenate([modes.noise_gain.numpy(), modes.noise_gain.numpy().conj()])
+        rates = lam[:, None] + lam.conj()[None]
+        sigma = -(L @ L.conj().T) / rates
+        for k, step in enumerate(np.diff(record.time)):
+            gain = (np.expm1(lam * step) / lam)[:, None] * B
+            self.F.append(np.diag(np.exp(lam * step)) + gain[:, d:] @ slope @ self.H)
+            seen = slope @ (u[k] @ D.T) + constant  # f sees the layer's output, u acts at once
+            self.drive.append(gain[:, :d] @ u[k] + gain[:, d:] @ seen)
+            self.Q.append(-sigma * np.expm1(rates * step))
+        first = layer.first_state.numpy()
+        self.m0 = np.concatenate([first, first.conj()])
+        self.P0 = sigma
+        self.noise = system.noise.constant_sd.numpy() ** 2
+        self.scale, self.shift = scaling.output_scale, scaling.output_offset
+
+    def filter(self, y=None, n=None):
+        """Log density of scaled outputs, mean and covariance of each before its own sample."""
+        n = len(self.level) if y is None else len(y)
+        m, P, total, means, covariances = self.m0, self.P0, 0.0, [], []
+        for k in range(n):
+            if k:
+                m = self.F[k - 1] @ m + self.drive[k - 1]
+                P = self.F[k - 1] @ P @ self.F[k - 1].conj().T + self.Q[k - 1]
+            means.append((self.H @ m).real + self.level[k])
+            covariances.append((self.H @ P @ self.H.conj().T).real)
+            there = np.zeros(0, int) if y is None else np.flatnonzero(~np.isnan(y[k]))
+            if not len(there):
+                continue
+            H = self.H[there]
+            S = (H @ P @ H.conj().T).real + np.diag(self.noise[there])
+            e = y[k, there] - means[-1][there]
+            total += -0.5 * (e @ np.linalg.solve(S, e) + np.linalg.slogdet(2 * np.pi * S)[1])
+            K = P @ H.conj().T @ np.linalg.inv(S)
+            m, P = m + K @ e, P - K @ H @ P
+        return total, np.array(means), np.array(covariances)
+
+    def scaled(self, y):
+        return (y - self.shift) / self.scale
