@@ -56,8 +56,8 @@ def used(problem):
     names = set(Values._fields)
     if 0 not in forms:
         names -= set(TABLES)
-    if not forms - {0}:
-        names -= set(RADIAL)
+    if not forms - {0}:  # a table has a line beside it, but not where it is measured
+        names -= set(RADIAL) - ({"slope"} if len(layout.form) > (layout.measured >= 0) else set())
     if not len(layout.form):
         names -= {"G", "offset", "gamma"}
     if layout.measured >= 0:
