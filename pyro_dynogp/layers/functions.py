@@ -13,6 +13,7 @@ The outputs of a layer share kernel and locations and are independent given them
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -148,7 +149,10 @@ class StaticFunction:
             residual: (*b, e, K) standard normal innovations.
             support: (*b, K, d) support points.
         """
-        self._check_points("x", x)
+        return self.drawn(residual, support).mean(x)
+
+    def drawn(self, residual: Tensor, support: Tensor) -> DrawnFunction:
+        """The function that `path` follows, as weights of the kernel at Z and at the support."""
         self._check_points("support", support)
         _check_shape("residual", residual, self.outputs, support.shape[-2])
         A = _solve(self.root, self.kernel(self.locations, support))
@@ -159,9 +163,16 @@ class StaticFunction:
         own = _solve(root.mT, residual.mT, True)
         shared = _solve(self.root.mT, A @ own, True)
         scale = self.output_scale.unsqueeze(-2)
-        drawn = self.kernel(x, support) @ (scale * own)
-        given = self.kernel(x, self.locations) @ (self.weights.mT - scale * shared)
-        return self.prior_mean(x) + given + drawn
+        return DrawnFunction(
+            self.kernel,
+            _stacked([self.locations, support]),
+            _stacked([self.weights.mT - scale * shared, scale * own]).mT,
+            self.output_scale,
+            self.constant,
+            self.slope,
+            self.name,
+            self.limits,
+        )
 
     def _check_points(self, argument: str, x: Tensor) -> None:
         if x.dim() < 2 or x.shape[-1] != self.channels:
@@ -170,6 +181,26 @@ class StaticFunction:
                 expected=f"shape (..., n, {self.channels})",
                 got=f"shape {tuple(x.shape)}",
             )
+
+
+class DrawnFunction(StaticFunction):
+    """One function that is known everywhere: `whitened` holds the weights of the kernel."""
+
+    @property
+    def weights(self) -> Tensor:  # type: ignore[override]
+        """Weights (*b, e, M), scale included."""
+        return self.whitened
+
+    def moments(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Its values at points x (*b, n, d), and no variance."""
+        mean = self.mean(x)
+        return mean, torch.zeros_like(mean)
+
+
+def _stacked(parts: Sequence[Tensor]) -> Tensor:
+    """Parts (*b, K, m) one below the other."""
+    batch = broadcast(*(part.shape[:-2] for part in parts))
+    return torch.cat([part.expand(batch + part.shape[-2:]) for part in parts], -2)
 
 
 def _check_shape(argument: str, x: Tensor, *shape: int) -> None:

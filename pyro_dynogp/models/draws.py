@@ -71,8 +71,13 @@ class JointState:
 
     def root(self) -> Tensor:
         """Square root (*b, N, N) of the covariance, singular or not."""
-        values, vectors = torch.linalg.eigh(self.covariance)
-        return vectors * values.clamp_min(0.0).sqrt().unsqueeze(-2)
+        return root_of(self.covariance)
+
+
+def root_of(covariance: Tensor) -> Tensor:
+    """Square root (*b, N, N) of a covariance, singular or not."""
+    values, vectors = torch.linalg.eigh(covariance)
+    return vectors * values.clamp_min(0.0).sqrt().unsqueeze(-2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +85,8 @@ class Randomness:
     """Standard normal numbers behind one set of draws: with the same ones, two draws compare.
 
     Attributes:
-        state: (*shape, N). innovations: (*shape, n) or (*shape, n, w) for each dynamic layer.
+        state: (*shape, N). innovations: (*shape, n) or (*shape, n, w) for each dynamic layer; with
+            feedback (*shape, n, 2P), of its state.
         residual: (*shape, e, K) for each static layer.
     """
 
@@ -97,6 +103,8 @@ class Randomness:
             if isinstance(layer, DynamicSystem):
                 states += 2 * layer.modes.pairs
                 event = (n, layer.modes.outputs) if layer.modes.several_outputs else (n,)
+                if system.has_feedback:
+                    event = (n, 2 * layer.modes.pairs)
                 innovations[one.name] = torch.randn(*shape, *event, dtype=torch.float64)
             else:
                 assert isinstance(one.layer, Static)
@@ -203,7 +211,7 @@ def draw_layers(
             if not modes.several_outputs:
                 value, mean, variance = (v.unsqueeze(-1) for v in (value, mean, variance))
         else:
-            value, mean, variance = _static(
+            value, mean, variance = draw_static(
                 one.layer, layer, x, random.residual[one.name], switches
             )
             if one.last:
@@ -215,7 +223,7 @@ def draw_layers(
     return Drawn(signals, mean, variance.expand(mean.shape))
 
 
-def _static(
+def draw_static(
     spec: Any, layer: StaticSystem, x: Tensor, residual: Tensor, switches: Switches
 ) -> tuple[Tensor, Tensor, Tensor]:
     """One function along x, or its mean; mean and variance at each point."""

@@ -22,10 +22,10 @@ from pyro_dynogp.models.draws import (
     JointState,
     Randomness,
     Switches,
-    draw_layers,
     first_state,
     noise_variance,
 )
+from pyro_dynogp.models.feedback_draws import draw_outputs
 from pyro_dynogp.models.system import DynamicSystem, System
 from pyro_dynogp.support.parallel import seeded
 from pyro_dynogp.support.tensors import as_tensor, broadcast
@@ -195,15 +195,16 @@ class OutputProcess(TorchDistribution):
             with seeded(seed):
                 return Randomness.draw(system, len(grid), shape)
 
-        drawn = draw_layers(system, grid, inputs, start, random(), switches)
+        drawn = draw_outputs(system, grid, inputs, start, random(), switches)
         scale, shift = self.scaling.output_scale, self.scaling.output_offset
         mean, variance = shift + scale * flat(drawn.mean), scale**2 * flat(drawn.variance)
         generator = np.random.default_rng(seed)
         noise = scale**2 * noise_variance(system.noise.likelihood, sd, len(mean), generator)
         joint, spread = mean, variance
-        if isinstance(system.layers[-1], DynamicSystem):  # its own draw is joint in time
+        wire, layer = system.output
+        if isinstance(layer, DynamicSystem):  # its own draw is joint in time
             level = system.level(inputs)
-            signal = drawn.signals[system.wires[-1].name]
+            signal = drawn.signals[wire.name]
             joint = shift + scale * flat(signal if level is None else signal + level)
             spread = np.zeros_like(variance)
 
@@ -216,7 +217,7 @@ class OutputProcess(TorchDistribution):
 
             def at(some: Switches) -> Any:
                 used = numbers if some.any else numbers.first
-                return draw_layers(system, grid, inputs, start, used, some)
+                return draw_outputs(system, grid, inputs, start, used, some)
 
             with torch.no_grad():
                 shares = decompose(system, at, switches, scale)
@@ -232,9 +233,10 @@ class OutputProcess(TorchDistribution):
             start = self.start or first_state(system)
             random = Randomness.draw(system, len(grid), shape)
             on = Switches.all_on(system, several_channels=True)  # the model as it is stated
-            drawn = draw_layers(system, grid, inputs, start, random, on)
-            signal = drawn.signals[system.wires[-1].name]
-            if isinstance(system.layers[-1], DynamicSystem):
+            drawn = draw_outputs(system, grid, inputs, start, random, on)
+            wire, layer = system.output
+            signal = drawn.signals[wire.name]
+            if isinstance(layer, DynamicSystem):
                 level = system.level(inputs)
                 signal = signal if level is None else signal + level
             else:

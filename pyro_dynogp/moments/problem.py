@@ -20,7 +20,7 @@ from pyro_dynogp.moments.functions import TABLE, gauss_hermite
 from pyro_dynogp.moments.layout import Layout, Values, zero_bars
 
 # Dimensions of each value right of the batch.
-_EVENTS = {
+EVENTS = {
     "re": 2,
     "im": 2,
     "Q": 3,
@@ -81,7 +81,7 @@ class FilterProblem:
 
     def flat(self) -> tuple[list[Tensor], torch.Size]:
         """All tensors with one common batch dimension, and the batch shape."""
-        return flatten_batch(self.tensors(), [_EVENTS[name] for name in Values._fields])
+        return flatten_batch(self.tensors(), [EVENTS[name] for name in Values._fields])
 
     def elements(self) -> tuple[list[Values], torch.Size]:
         """One `Values` of arrays for each batch element."""

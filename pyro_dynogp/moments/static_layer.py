@@ -66,7 +66,7 @@ def _cholesky_adjoint(d, root, root_bar, p_bar):
 
 
 @njit(**INLINED)
-def _expansion(i, layout, numbers):
+def expansion_of(i, layout, numbers):
     """The radial expansion of static layer i in `Values`, or the gradients by it."""
     d = layout.channels[i]
     first = layout.f_start[i]
@@ -149,7 +149,7 @@ def _average(i, layout, values, mean, block, work):
                 f[a] = total
                 block[a, a] += wq * variance
         else:
-            expansion(layout.form[i], z[:d], _expansion(i, layout, values), f[:e])
+            expansion(layout.form[i], z[:d], expansion_of(i, layout, values), f[:e])
         for a in range(e):
             mean[a] += wq * f[a]
             for c in range(d):
@@ -258,7 +258,7 @@ def _average_adjoint(i, layout, values, bars, m, m_bar, P_bar, work):
             bars.spacing[i] -= z_bar[0] * (z[0] - values.low[i]) / values.spacing[i]
             z_bar[0] += line_bar
         else:
-            part, part_bar = _expansion(i, layout, values), _expansion(i, layout, bars)
+            part, part_bar = expansion_of(i, layout, values), expansion_of(i, layout, bars)
             expansion_adjoint(layout.form[i], z[:d], part, f_bar, z_bar[:d], part_bar)
         for c in range(d):
             work.centre_bar[c] += z_bar[c]

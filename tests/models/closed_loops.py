@@ -39,6 +39,7 @@ def values_of(model, record, seed=0, linear=True):
     values["g_input_gain"] = 0.4 * torch.tanh(values["g_input_gain"])
     if linear:
         values["f_values"] = torch.zeros_like(values["f_values"])
+        values["f_output_scale"] = 1e-13 + torch.zeros_like(values["f_output_scale"])
     return values
 
 
