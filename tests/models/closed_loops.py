@@ -66,7 +66,7 @@ class ClosedLoop:
         slope, constant = function.slope.numpy(), function.constant.numpy()
         D = modes.D.numpy()[:, :d]
         self.level = u @ D.T + system.offset.numpy()
-        self.F, self.drive, self.Q = [], [], []
+        self.F, self.drive, self.Q, self.back = [], [], [], []
         L = np.zeros((2 * P, 1))
         if modes.has_process_noise:
             L = np.concatenate([modes.noise_gain.numpy(), modes.noise_gain.numpy().conj()])
@@ -77,6 +77,7 @@ class ClosedLoop:
             self.F.append(np.diag(np.exp(lam * step)) + gain[:, d:] @ slope @ self.H)
             seen = slope @ (u[k] @ D.T) + constant  # f sees the layer's output, u acts at once
             self.drive.append(gain[:, :d] @ u[k] + gain[:, d:] @ seen)
+            self.back.append(gain[:, d:])
             self.Q.append(-sigma * np.expm1(rates * step))
         first = layer.first_state.numpy()
         self.m0 = np.concatenate([first, first.conj()])
@@ -104,6 +105,31 @@ class ClosedLoop:
             K = P @ H.conj().T @ np.linalg.inv(S)
             m, P = m + K @ e, P - K @ H @ P
         return total, np.array(means), np.array(covariances)
+
+    def simulate(self, functions, rng):
+        """Scaled outputs (S, n, n_y) of runs with one function (S, m) -> (S, m) each beside the line.
+
+        Process and measurement noise act; the output is one, and no input acts on it at once.
+        """
+        half = len(self.m0) // 2
+        eye = np.eye(half)
+        real = 0.5 * np.block([[eye, eye], [-1j * eye, 1j * eye]])
+        count = len(functions(np.zeros(1)))
+
+        def noise(Q):
+            w = rng.multivariate_normal(np.zeros(2 * half), (real @ Q @ real.conj().T).real, count)
+            w = w[:, :half] + 1j * w[:, half:]
+            return np.concatenate([w, w.conj()], 1)
+
+        x, out = self.m0 + noise(self.P0), []
+        for k in range(len(self.level)):
+            g = (x @ self.H.T).real
+            e = rng.standard_normal((count, 1)) * np.sqrt(self.noise)
+            out.append(g + self.level[k] + e)
+            if k < len(self.F):
+                back = functions(g[:, 0])[:, None] * self.back[k][:, 0]
+                x = x @ self.F[k].T + self.drive[k] + back + noise(self.Q[k])
+        return np.stack(out, 1)
 
     def scaled(self, y):
         return (y - self.shift) / self.scale

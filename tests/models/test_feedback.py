@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 import torch
+from scipy.stats import ks_2samp
 
+from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.models.outputs import output_process
 from tests.models.closed_loops import ClosedLoop, make_record, spring, system_at, values_of
 
@@ -54,3 +56,65 @@ def test_process_noise_of_free_runs_is_that_of_the_linear_system(outputs, irregu
     assert (np.abs(error) < 5.0 * np.sqrt(variance / count) + 1e-9).all()
     ratio = found.var(0) / variance
     assert (np.abs(ratio[variance > 1e-12] - 1.0) < 5.0 * np.sqrt(2.0 / count)).all()
+
+
+def test_runs_with_drawn_functions_are_those_of_a_plain_simulation():
+    """Functions from their dense conditional, states step by step in numpy; KS at five times."""
+    count = 300
+    model = spring()
+    record = make_record(irregular=True, missing=False)
+    model = model.scaled_to(record)
+    values = values_of(model, record, seed=5, linear=False)
+    values["g_feedthrough"] = 0.0 * values["g_feedthrough"]
+    values["f_lengthscale"] = 1.0 + 0.0 * values["f_lengthscale"]
+    values["f_half_width"] = 2.0 + 0.0 * values["f_half_width"]
+    system = system_at(model, values)
+    loop = ClosedLoop(model, system, record)
+    function = system.layer("f").function
+    rng = np.random.default_rng(0)
+    grid = np.linspace(-8.0, 8.0, 321)
+
+    def matern(a, b):
+        r = np.sqrt(3.0) * np.abs(a[:, None] - b)
+        return (1.0 + r) * np.exp(-r)
+
+    Z, v = function.locations.numpy()[:, 0], function.whitened.numpy()[0]
+    L = np.linalg.cholesky(matern(Z, Z) + 1e-8 * np.eye(len(Z)))
+    A = np.linalg.solve(L, matern(Z, grid))
+    rest = matern(grid, grid) - A.T @ A
+    drawn = rng.multivariate_normal(A.T @ v, rest, count, method="eigh")
+    drawn *= float(function.output_scale)
+
+    def functions(x):
+        x = np.broadcast_to(x, (count,)) if x.size == 1 else x
+        return np.array([np.interp(a, grid, f) for a, f in zip(x, drawn, strict=True)])
+
+    expected = loop.simulate(functions, rng)[..., 0]
+    with torch.random.fork_rng():
+        torch.manual_seed(1)
+        process = output_process(system, model.scaling, record)
+        found = loop.scaled(process.sample((count,)).numpy()[..., None])[..., 0]
+    assert expected[:, 30].std() > 2.0 * float(loop.noise[0]) ** 0.5
+    for time in (5, 12, 20, 30, 39):
+        assert ks_2samp(found[:, time], expected[:, time]).pvalue > 0.01, time
+    runs = process.components(samples=count, seed=2)
+    y = runs.mean + np.sqrt(runs.noise_variance) * rng.standard_normal(runs.mean.shape)
+    for time in (5, 12, 20, 30, 39):
+        assert ks_2samp(loop.scaled(y)[:, time, 0], expected[:, time]).pvalue > 0.01, time
+
+
+@pytest.mark.parametrize("outputs", [1, 2])
+def test_gradient_is_that_of_finite_differences(outputs):
+    model = spring(outputs)
+    record = make_record(1, outputs, irregular=True)
+    model = model.scaled_to(record)
+    potential = Potential(model, (record,), values_of(model, record, seed=3, linear=False))
+    z = potential.pack(potential.at).numpy()
+    value, gradient = potential.values_and_gradients(z[None])
+    assert np.isfinite(value).all()
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        move = rng.standard_normal(len(z))
+        h = 1e-5 / np.linalg.norm(move)
+        ends = potential.values_and_gradients(np.stack([z + h * move, z - h * move]))[0]
+        assert (ends[0] - ends[1]) / (2.0 * h) == pytest.approx(gradient[0] @ move, rel=1e-5)
