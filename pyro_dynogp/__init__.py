@@ -53,6 +53,7 @@ if TYPE_CHECKING:  # the same names, for editors and type checkers; a test compa
     from pyro_dynogp.models.architectures import Cascade as Cascade
     from pyro_dynogp.models.architectures import Hammerstein as Hammerstein
     from pyro_dynogp.models.architectures import HammersteinWiener as HammersteinWiener
+    from pyro_dynogp.models.architectures import NonlinearFeedback as NonlinearFeedback
     from pyro_dynogp.models.architectures import LinearDynamicGP as LinearDynamicGP
     from pyro_dynogp.models.architectures import Wiener as Wiener
     from pyro_dynogp.models.architectures import WienerHammerstein as WienerHammerstein
@@ -87,6 +88,7 @@ HOMES = {
     "Hammerstein": "models.architectures",
     "WienerHammerstein": "models.architectures",
     "HammersteinWiener": "models.architectures",
+    "NonlinearFeedback": "models.architectures",
     "Cascade": "models.architectures",
     "Model": "models.model",
     "Dynamic": "models.wiring",

@@ -150,6 +150,38 @@ def WienerHammerstein(
     return Model(inputs, layers, likelihood or Gaussian(), **options)
 
 
+def NonlinearFeedback(
+    inputs: int,
+    *,
+    outputs: int = 1,
+    pairs: int = 1,
+    inducing: int = 32,
+    kernel: Any = None,
+    process_noise: bool = True,
+    likelihood: Likelihood | None = None,
+    **options: Any,
+) -> Model:
+    """Linear dynamics g whose output comes back through a static nonlinearity f.
+
+    A spring or friction that is not linear, a tank that empties through a valve:
+    x' = A x + B u + F f(C x), y = C x + D u, with f held from sample to sample. Beyond the data f
+    goes on as a straight line.
+
+    Args: as those of `Wiener`; f sees all outputs and has as many, the output measured is g's.
+
+    Example:
+        >>> model = NonlinearFeedback(1, pairs=1)
+        >>> [wire.name for wire in model.wires], model.output_wire.name
+        (['g', 'f'], 'g')
+    """
+    layers = (
+        Dynamic(outputs=outputs, pairs=pairs, process_noise=process_noise, feedback=("f",)),
+        Static(outputs=outputs, inducing=inducing, kernel=kernel),
+    )
+    options = {"integrate": "all", "output": "g", **options}
+    return Model(inputs, layers, likelihood or Gaussian(), **options)
+
+
 def HammersteinWiener(
     inputs: int,
     *,

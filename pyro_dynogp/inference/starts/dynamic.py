@@ -51,6 +51,8 @@ class DynamicStart:
             self.one.name + name[1:]: value for name, value in linear.items() if name[:2] == "g_"
         }
         layer = self.layer
+        if self.one.fed:
+            values[self._key("input_gain")] = self._fed_back(values[self._key("input_gain")])
         if layer.outputs > 1 and self._key("output_gain") not in values:
             # One signal is the linear fit; the others see the same modes with other gains.
             P = layer.pairs
@@ -71,6 +73,13 @@ class DynamicStart:
             values = {k: v for k, v in values.items() if "_noise_gain" not in k}
         return values
 
+    def _fed_back(self, gain: Tensor) -> Tensor:
+        """Gains (P, d + fed, 2): what comes back acts somewhat as the inputs do, sign at random."""
+        shape = (len(gain), self.one.fed, 2)
+        like = gain.mean(1, keepdim=True) if gain.shape[1] else torch.ones(shape).double()
+        sign = float(self.generator.choice([-1.0, 1.0]))
+        return torch.cat([gain, 0.5 * sign * like.expand(shape) + self._random(*shape)], 1)
+
     def near_identity(self) -> Values:
         """Each output is an input, beside small random dynamics."""
         layer, d = self.layer, self.one.channels
@@ -81,8 +90,9 @@ class DynamicStart:
             self._key("log_decay"): torch.tensor(np.log(-poles.real / rate)),
             self._key("log_frequency"): torch.tensor(np.log(poles.imag / rate)),
         }
+        if d + self.one.fed:
+            values[self._key("input_gain")] = self._random(P, d + self.one.fed, 2)
         if d:
-            values[self._key("input_gain")] = self._random(P, d, 2)
             if layer.feedthrough:
                 D = torch.eye(layer.outputs, d, dtype=torch.float64)
                 D = D + self._random(layer.outputs, d)
@@ -112,7 +122,8 @@ class DynamicStart:
         with torch.no_grad():
             time_scale = TimeScale.of(self.scaling)
             layer = self.model.dynamic_system(self.one, self.layer, values, time_scale)
-            return layer.mean(x, record.time)
+            silent = x.new_zeros((*x.shape[:-1], self.one.fed))
+            return layer.mean(torch.cat([x, silent], -1), record.time)
 
     def scale(self, values: Values, factor: float) -> None:
         """Multiply the layer's output."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -81,7 +81,7 @@ def plans(
     seeds = child_seeds(seed, count)
     if not names:
         return [Plan(None, None, bool(index % 2), s) for index, s in enumerate(seeds)]
-    bends = isinstance(model.layers[-1], Static)
+    bends = isinstance(model.output_wire.layer, Static)
     out = []
     used = dict.fromkeys(names, 0)  # linear optima, best first
     for index, s in enumerate(seeds):
@@ -102,7 +102,8 @@ def starting_point(model: Model, records: Sequence[Record], scaling: Scaling, pl
 
     The leading layer is the linear fit, other dynamic layers pass their input on with small random
     dynamics beside it, and static layers start as the identity on the range of their input: the
-    cascade starts as the linear model, whose offset and noise it takes over.
+    cascade starts as the linear model, whose offset and noise it takes over. From static layers in
+    feedback nothing comes back at first.
     """
     generator = np.random.default_rng(plan.seed)
     values: Values = {}
@@ -117,6 +118,7 @@ def starting_point(model: Model, records: Sequence[Record], scaling: Scaling, pl
         targets = [y - a for y, a in zip(targets, added, strict=True)]
     size = 1.0  # what signals below the leading layer were divided by
     level = torch.zeros(model.outputs, dtype=torch.float64)
+    back = {name for one in model.wires for name in one.feedback}
     if plan.linear is not None:
         level = level + plan.linear["offset"]
     for one in model.wires:
@@ -136,14 +138,19 @@ def starting_point(model: Model, records: Sequence[Record], scaling: Scaling, pl
             outputs = [o * factor for o in outputs]
         else:
             assert isinstance(one.layer, Static)
+            if one.sources == (model.output_wire.name,):  # seen where it was measured
+                known = [torch.where(y.isnan(), s, y - level) for y, s in zip(targets, seen, strict=True)]
+                seen = known if one.name in back else seen
             line = (size, level) if one.last else None
+            if one.name in back and not one.last:  # nothing comes back as yet
+                line = (0.0, torch.zeros(one.layer.outputs, dtype=torch.float64))
             curve = torch.cat(targets) if one.last and plan.curved else None
             reach = torch.cat(targets) if one.last else None
             outputs = start_static(model, one, one.layer, values, seen, line, curve, reach)
         for signal, out in zip(signals, outputs, strict=True):
             signal[one.name] = out
-    last = model.wires[-1].name
-    if isinstance(model.layers[-1], Dynamic):
+    last = model.output_wire.name
+    if isinstance(model.output_wire.layer, Dynamic):
         values["offset"] = level
     if plan.linear is not None and not plan.curved:
         noise = plan.linear["noise_sd"].expand(model.outputs)
@@ -187,8 +194,9 @@ def _linear_state(
     assert isinstance(layer, Dynamic)
     if layer.outputs != model.outputs:
         return torch.zeros(2 * layer.pairs, dtype=torch.float64)
+    alone = (replace(layer, feedback=()),)
     twin = Model(
-        model.inputs, (layer,), direct=model.direct, initial_state="integrated", scaling=scaling
+        model.inputs, alone, direct=model.direct, initial_state="integrated", scaling=scaling
     )
     with torch.no_grad():
         ((place, _),) = twin.dynamic

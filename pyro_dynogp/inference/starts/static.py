@@ -26,7 +26,7 @@ def start_static(
     """Add a static layer's values; its outputs along the mean trajectories.
 
     Args:
-        line: slope and level (e,) of the function, None for the identity.
+        line: slope and level (e,) of the function, None for the identity; slope 0 without `reach`.
         curve: (n, e) what its outputs should be on average; None for a straight line.
         reach: (n, e) outputs that the straight line should be able to reach, or None.
     """
@@ -53,7 +53,9 @@ def start_static(
     values[f"{name}_constant"] = torch.zeros(e, dtype=torch.float64)
     values[f"{name}_output_scale"] = torch.full((e,), 1.5, dtype=torch.float64)
     if layer.mean == "linear":
-        values[f"{name}_slope"] = torch.eye(e, d, dtype=torch.float64)
+        level = line is not None and line[0] == 0.0
+        slope = torch.zeros if level else torch.eye
+        values[f"{name}_slope"] = slope(e, d, dtype=torch.float64)
     if layer.kernel is None:
         spread = (high - low) / (4.0 if d == 1 else 1.5)
         values[f"{name}_lengthscale"] = spread.clamp(0.1, 10.0)
