@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.records import as_records
+from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.optimise.maximum import Optimum
+from pyro_dynogp.inference.starts.poles import grown
 from pyro_dynogp.lti.arithmetic import SEGMENT
 from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.models.assembly import assemble
@@ -19,6 +24,9 @@ from pyro_dynogp.moments.stepping import step_through
 
 # Blocks of a record at most, and segments of the filter in one at least.
 BLOCKS, LEAST = 8, 2
+# What is left of noise gains that are switched off, and the share of the error that noise has to
+# take away to pay.
+SILENT, WORTH = 1e-3, 0.01
 
 
 def free_run_error(model: Model, values: Mapping[str, Tensor], records: Sequence[Record]) -> float:
@@ -59,11 +67,34 @@ def free_run_error(model: Model, values: Mapping[str, Tensor], records: Sequence
                 there = ~np.isnan(numbers.y[part])
                 squares += float((error[there] ** 2).sum())
                 count += int(there.sum())
-    error_ = float(np.sqrt(squares / max(count, 1)))
-    return error_ if np.isfinite(error_) else np.inf
+    total = float(np.sqrt(squares / max(count, 1)))
+    return total if np.isfinite(total) else np.inf
 
 
-def silenced(model: Model, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Values with next to no process noise in any layer that inputs drive."""
-    quiet = {f"{w.name}_noise_gain_unit" for w, _ in model.dynamic if w.channels + w.fed}
-    return {k: v * 1e-3 if k in quiet else v for k, v in values.items()}
+def silenced(
+    model: Model,
+    records: Record | Sequence[Record],
+    optimum: Optimum,
+    start: Mapping[str, Tensor],
+) -> Optimum:
+    """An optimum found without process noise as a point of the model that has some: next to none.
+
+    Args:
+        model: with process noise, collapsed. records: of it. optimum: without.
+        start: values of all sites of the model.
+    """
+    off = {f"{w.name}_noise_gain_unit" for w, _ in model.dynamic if w.channels + w.fed}
+    values = grown(optimum.values, dict(start))
+    values = {k: SILENT * v if k in off else v for k, v in values.items()}
+    potential = Potential(model, (records,), values)
+    (energy,), _ = potential.values_and_gradients(potential.pack(values).numpy()[None])
+    return replace(optimum, energy=float(energy), values=values)
+
+
+def noise_pays(
+    model: Model, records: Record | Sequence[Record], noisy: Optimum, quiet: Optimum
+) -> bool:
+    """Whether free runs over blocks are better by a hundredth with process noise than without."""
+    several = as_records(records)
+    with_noise, without = (free_run_error(model, one.values, several) for one in (noisy, quiet))
+    return with_noise < (1.0 - WORTH) * without

@@ -12,6 +12,7 @@ from torch import Tensor
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.methods.base import Problem
+from pyro_dynogp.inference.methods.mode import suited_optimizer
 from pyro_dynogp.inference.methods.nuts import sample_posterior
 from pyro_dynogp.inference.methods.optima import (
     POLISH,
@@ -64,7 +65,7 @@ def refit(fit: FittedKind, records: Record | Sequence[Record]) -> FittedKind:
         target,
         argument,
         optima_of(fit),
-        optimizer="adam" if cascade else "lbfgs",
+        optimizer=suited_optimizer(fit.model),
         steps=CASCADE_STEPS if cascade else LINEAR_STEPS,
         seed=fit.seed,
         workers=1,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, get_args
@@ -12,6 +13,7 @@ import numpy as np
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.density import WALL
 from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.free_runs import free_run_error, noise_pays, silenced
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.optimise.maximum import EFFORT, Optimizer, Optimum, maximise
 from pyro_dynogp.inference.posteriors import Mixture
@@ -36,6 +38,13 @@ from pyro_dynogp.support.parallel import seeded
 # Starts and iterations of the linear fits that come first.
 LINEAR_STARTS = 6
 LINEAR_STEPS = 150
+# Sets of starts of a model with feedback, until one beats the linear model in free runs; and what is
+# said where none does.
+ATTEMPTS = 2
+NO_BETTER = (
+    "fit: free runs through the training record are no better than those of the linear model that "
+    "the climb began from. Try more pairs, other restarts (seed), or a longer record."
+)
 # Measurement noise, in sds of the outputs, from which starts without process noise climb at least.
 UNEXPLAINED = 0.5
 
@@ -104,7 +113,7 @@ class Mode:
     Attributes:
         optimizer: "lbfgs", "preconditioned" (L-BFGS in coordinates that Hessians make round, which
             gets to the top of long ridges) or "adam"; None for "adam" where the model has static
-            layers, else "lbfgs". The highest mode may be one that fits the noise.
+            layers but no feedback, else "lbfgs". The highest mode may be one that fits the noise.
 
     Raises:
         ValueError: on an unknown optimizer.
@@ -153,8 +162,8 @@ def best_optima(
         ValueError: where no start leads to a point with a density.
     """
     model, records, learnt = problem.model, problem.records, problem.learnt
-    optimizer = optimizer or ("adam" if model.has_function else "lbfgs")
-    restarts = run.restarts or (8 if model.has_function else 6)
+    optimizer = optimizer or suited_optimizer(model)
+    restarts = run.restarts or (4 if model.has_feedback else 8 if model.has_function else 6)
     options: dict[str, Any] = {
         "optimizer": optimizer, "seed": run.seed, "workers": run.workers,
         "progress": run.progress, "checkpoints": run.checkpoints,
@@ -167,18 +176,36 @@ def best_optima(
         optima = maximise(problem.target, problem.argument, starts, steps=steps, **options)
     else:
         steps = steps or 600
-        starts = starting_points(
-            problem.target, records, restarts, steps, run.seed, run.workers, run.progress,
-            run.checkpoints,
-        )  # fmt: skip
-        warm = [] if learnt is None else [grown(learnt, starts[0])]
-        optima = climb(problem.target, problem.argument, starts, warm, steps=steps, **options)
+        optima, least = [], math.inf
+        for attempt in range(ATTEMPTS if model.has_feedback else 1):
+            starts = starting_points(
+                problem.target, records, restarts, steps, run.seed + attempt, run.workers,
+                run.progress, run.checkpoints,
+            )  # fmt: skip
+            warm = [] if learnt is None else [grown(learnt, starts[0])]
+            options["prefix"] = f"again-{attempt}-" if attempt else ""
+            optima += climb(problem.target, problem.argument, starts, warm, steps=steps, **options)
+            optima.sort(key=lambda one: one.energy)
+            if not model.has_feedback:
+                break
+            # Nothing comes back in a start: it is the linear model.
+            errors = [free_run_error(problem.target, start, records) for start in starts]
+            least = min(least, *errors)
+            if free_run_error(problem.target, optima[0].values, records) < least:
+                break
+        else:
+            warnings.warn(NO_BETTER, stacklevel=2)
     if optima[0].energy >= WALL:
         raise ValueError(
             "fit: no start reached a point where the likelihood can be evaluated. Check the "
             "record for jumps of many orders of magnitude, or try fewer pairs."
         )
     return optima
+
+
+def suited_optimizer(model: Model) -> Optimizer:
+    """What climbs best: Adam where functions see what dynamics make, but not in a loop."""
+    return "adam" if model.has_function and not model.has_feedback else "lbfgs"
 
 
 def at_optimum(
@@ -207,6 +234,7 @@ def climb(
     *,
     steps: int,
     checkpoints: Checkpoints = NOTHING_KEPT,
+    prefix: str = "",
     **options: Any,
 ) -> list[Optimum]:
     """Optima of the collapsed model from fresh starts and from what is learnt, best first.
@@ -214,19 +242,32 @@ def climb(
     Where static layers see process noise fresh starts take half of the steps without any, which
     needs no filter, and the better half of them takes the other half with it. Such noise can
     explain all that dynamics and functions should: from a poor start to a high density and poor
-    forecasts.
+    forecasts. With feedback the noise stays only where free runs are better with it.
+
+    Args:
+        model: collapsed. records: of it. starts, learnt: values of all sites.
+        steps: most of each start. checkpoints: what keeps pieces. prefix: of their keys.
+        options: of `maximise`.
     """
     options["checkpoints"] = checkpoints
     options["effort"] = replace(options.get("effort", EFFORT), kept=0.5)
     quiet = without_noise_below_functions(model)
+    better: list[Optimum] = []
     if quiet != model and starts:
         steps = max(1, steps // 2)
-        key = "without-process-noise"
+        key = f"{prefix}without-process-noise"
         louder = [_louder(start) for start in starts]
         found = maximise(quiet, records, louder, steps=steps, key=key, **options)
         better = found[: (len(starts) + 1) // 2]
         starts = [grown(one.values, starts[0]) for one in better]
-    return maximise(model, records, [*learnt, *starts], steps=steps, key="cascade", **options)
+    elif model.has_feedback:
+        starts = [_louder(start) for start in starts]
+    key = f"{prefix}cascade"
+    optima = maximise(model, records, [*learnt, *starts], steps=steps, key=key, **options)
+    if not model.has_feedback or not better:
+        return optima
+    silent = [silenced(model, records, one, starts[0]) for one in better]
+    return optima if noise_pays(model, records, optima[0], silent[0]) else silent
 
 
 def grow(

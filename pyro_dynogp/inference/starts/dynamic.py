@@ -69,6 +69,8 @@ class DynamicStart:
                 values[self._key("feedthrough")] = torch.cat([D.reshape(1, -1), rest])
             if layer.process_noise:
                 values.update(self._small_noise())
+        if layer.process_noise and self._key("noise_gain_unit") not in values:
+            values.update(self._small_noise())
         if not layer.process_noise:
             values = {k: v for k, v in values.items() if "_noise_gain" not in k}
         return values

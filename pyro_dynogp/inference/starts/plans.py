@@ -34,7 +34,7 @@ def linear_twin(model: Model, layer: Dynamic, scaling: Scaling) -> Model:
         noise=layer.noise,
         brownian=layer.brownian,
         feedthrough=layer.feedthrough,
-        process_noise=layer.process_noise or model.inputs == model.direct,
+        process_noise=(layer.process_noise and not layer.feedback) or model.inputs == model.direct,
         scaling=scaling,
     )
 
@@ -194,7 +194,8 @@ def _linear_state(
     assert isinstance(layer, Dynamic)
     if layer.outputs != model.outputs:
         return torch.zeros(2 * layer.pairs, dtype=torch.float64)
-    alone = (replace(layer, feedback=()),)
+    noisy = "g_noise_gain_unit" in linear
+    alone = (replace(layer, feedback=(), process_noise=noisy),)
     twin = Model(
         model.inputs, alone, direct=model.direct, initial_state="integrated", scaling=scaling
     )
