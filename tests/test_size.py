@@ -13,7 +13,7 @@ LINES = 31_500
 LINES_TODAY = 36_600  # the package of the version before had 34 928; to shrink, and to go
 
 # What is larger today; what has shrunk has to leave the list.
-LARGE_FILES = {"models/model.py", "models/priors.py"}
+LARGE_FILES: set[str] = set()
 LONG_FUNCTIONS: set[str] = set()
 MANY_ARGUMENTS: set[str] = set()
 

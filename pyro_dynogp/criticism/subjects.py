@@ -22,6 +22,7 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.refit import refit
 from pyro_dynogp.models.output_process import OutputProcess
 from pyro_dynogp.models.outputs import output_process
+from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
@@ -111,11 +112,12 @@ class FitSubject:
 
     def _along(self, record: Record, index: int | None, kind: Kind, horizon: int) -> np.ndarray:
         """Densities of a record's measured samples."""
+        along = PreparedRecord.of(record, self.fit.scaling)
 
         def observed(part: Fitted) -> OutputProcess:
-            return observed_of(part, record, index)
+            return observed_of(part, along, index)
 
-        found = densities_at(self.fit, self.draws.values, record, observed, kind, horizon)
+        found = densities_at(self.fit, self.draws.values, along, observed, kind, horizon)
         return found[:, ~record.missing]
 
     def without(self, left_out: np.ndarray) -> FitSubject:
@@ -137,7 +139,7 @@ class FitSubject:
 def densities_at(
     fit: Fitted,
     values: Values,
-    record: Record,
+    record: PreparedRecord,
     observed: Callable[[Fitted], OutputProcess],
     kind: Kind,
     horizon: int = 1,
@@ -149,18 +151,19 @@ def densities_at(
         observed: distribution of the outputs, of the fit with some of the draws.
         kind, horizon: see `pointwise_log_density`.
     """
-    y = record.tensors().observations
     count = len(next(iter(values.values())))
-    portion = max(1, AT_ONCE // (len(record) * record.n_outputs))
+    portion = max(1, AT_ONCE // record.observations.numel())
     parts = []
     for first in range(0, count, portion):
         some = fit.with_draws({k: v[first : first + portion] for k, v in values.items()})
         with torch.no_grad():
-            parts.append(pointwise_log_density(observed(some), y, kind, horizon=horizon))
+            parts.append(
+                pointwise_log_density(observed(some), record.observations, kind, horizon=horizon)
+            )
     return np.concatenate(parts)
 
 
-def observed_of(fit: Fitted, record: Record, index: int | None) -> OutputProcess:
+def observed_of(fit: Fitted, record: PreparedRecord, index: int | None) -> OutputProcess:
     """Distribution of a record's outputs for each draw of a fit.
 
     Args:
@@ -172,7 +175,7 @@ def observed_of(fit: Fitted, record: Record, index: int | None) -> OutputProcess
     if index is not None:
         suffix = "" if len(fit.records) == 1 else f"_{index}"
         states = fit.model.states_of(fit.draws, suffix)
-    return output_process(fit.model.begin(fit.system, states), fit.scaling, record)
+    return output_process(fit.model.begin(fit.system, states), record)
 
 
 @dataclass(frozen=True, eq=False)

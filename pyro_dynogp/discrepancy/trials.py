@@ -197,9 +197,9 @@ def forecast_errors(fit: Fit, record: Record, fold: np.ndarray) -> tuple[np.ndar
 
 def one_step_density(fit: Fit, record: Record) -> np.ndarray:
     """Log-density (n, n_y) of each output given the outputs before it, NaN where missing."""
-    prepared = fit.model.check(record)[0]
-    outputs = output_process(beginning(fit, prepared, predicting=True), fit.scaling, prepared)
-    each = pointwise_log_density(outputs, prepared.tensors().observations, "forecast")
+    (along,) = fit.model.prepare(record)
+    outputs = output_process(beginning(fit, along, predicting=True), along)
+    each = pointwise_log_density(outputs, along.observations, "forecast")
     return logsumexp(each, axis=0) - np.log(len(each))
 
 

@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.layers.functions import StaticFunction
 from pyro_dynogp.layers.noise import Noise
@@ -283,17 +282,3 @@ def see(signals: dict[str, Tensor], one: Wire) -> Tensor:
         return parts[0]
     batch = broadcast(*(p.shape[:-2] for p in parts))
     return torch.cat([p.expand(batch + p.shape[-2:]) for p in parts], -1)
-
-
-def scaled_inputs(scaling: Scaling, record: Record, inputs: Tensor | None = None) -> Tensor:
-    """Inputs (*b, n, n_u), by default a record's, in standard deviations of the training record."""
-    u = record.tensors().inputs if inputs is None else inputs
-    if not u.shape[-1]:
-        return u
-    return (u - as_tensor(scaling.input_offset)) / as_tensor(scaling.input_scale)
-
-
-def scaled_outputs(scaling: Scaling, record: Record) -> Tensor:
-    """Outputs (n, n_y) of a record, in standard deviations of the training record."""
-    y = record.tensors().outputs
-    return (y - as_tensor(scaling.output_offset)) / as_tensor(scaling.output_scale)

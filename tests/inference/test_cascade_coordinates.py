@@ -33,7 +33,7 @@ MODELS = {
 def potentials(name, seed=0):
     """The plain potential, the straight one, and an unconstrained vector near a start."""
     model = MODELS[name].scaled_to(RECORD)
-    values = starting_point(model, (RECORD,), model.scaling, Plan(None, None, False, 0))
+    values = starting_point(model, model.prepare(RECORD), Plan(None, None, False, 0))
     target = model.collapsed
     plain = Potential(target, (RECORD,), values)
     generator = torch.Generator().manual_seed(seed)

@@ -17,7 +17,7 @@ from pyro_dynogp.inference.starts.poles import starting_values
 @pytest.fixture(scope="module")
 def potential(record):
     model = dgp.LinearDynamicGP(inputs=1, pairs=2).scaled_to(record)
-    values = starting_values(model, (record,), count=1, seed=0)[0]
+    values = starting_values(model, model.prepare(record), count=1, seed=0)[0]
     return Potential(model, (record,), values), values
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 import pyro_dynogp as dgp
 from pyro_dynogp.models.outputs import engine_for, output_process
+from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.prediction.first_state import beginning
 
 
@@ -31,7 +32,8 @@ def outputs_along(system, time, inputs, scale=None, shift=None, engine=None):
     """Outputs of a system along times and scaled inputs (n, n_u), by an engine or the usual one."""
     n_y = system.wires[-1].layer.outputs
     scaling = unit_scaling(inputs.shape[-1], n_y, scale, shift)
-    return (engine or engine_for(system))(system, scaling, time, inputs)
+    record = dgp.Record(time, inputs, np.zeros((len(time), n_y)))
+    return (engine or engine_for(system))(system, PreparedRecord.of(record, scaling))
 
 
 @contextmanager
@@ -48,5 +50,6 @@ def physical_of(fit):
 
 def prior_process(fit, record, *, unknown_start=False):
     """Noise-free trajectories of a linear fit along a record, for each draw."""
-    system = beginning(fit, record, predicting=unknown_start)
-    return output_process(system, fit.scaling, record).process.process
+    (along,) = fit.model.prepare(record)
+    system = beginning(fit, along, predicting=unknown_start)
+    return output_process(system, along).process.process

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from torch import Tensor
 
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.prepared import PreparedRecord
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,8 +26,23 @@ class Problem:
     """
 
     model: Model
-    records: tuple[Record, ...]
+    records: tuple[PreparedRecord, ...]
     learnt: Mapping[str, Tensor] | None = None
+
+    @classmethod
+    def of(
+        cls, model: Model, records: Record | Sequence[Record], start: Fitted | None = None
+    ) -> Problem:
+        """Records checked and prepared, the model in their units; `start` is a fit to start from.
+
+        Raises:
+            ValueError: as of `Model.check`; on constant or entirely missing signals.
+        """
+        checked = model.check(records)
+        scaling = Scaling.from_records(checked)
+        prepared = tuple(PreparedRecord.of(record, scaling) for record in checked)
+        learnt = None if start is None else dict(start.mode)
+        return cls(replace(model, scaling=scaling), prepared, learnt)
 
     @property
     def target(self) -> Model:
@@ -33,9 +50,17 @@ class Problem:
         return self.model.collapsed
 
     @property
-    def argument(self) -> Record | tuple[Record, ...]:
-        """What the Pyro model is called with."""
-        return self.records[0] if len(self.records) == 1 else self.records
+    def scaling(self) -> Scaling:
+        """In whose units the model is fitted."""
+        return self.records[0].scaling
+
+    @property
+    def identity(self) -> tuple[object, ...]:
+        """Everything that changes the result, with the same `repr` in every process."""
+        own = (self.model, [each.record.fingerprint for each in self.records])
+        if self.learnt is None:
+            return own
+        return (*own, {name: value.tolist() for name, value in self.learnt.items()})
 
 
 class Method(Protocol):

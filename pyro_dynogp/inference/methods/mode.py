@@ -9,11 +9,11 @@ from typing import Any, get_args
 
 import numpy as np
 
-from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.density import WALL
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.methods.base import Problem
-from pyro_dynogp.inference.optimise.maximum import EFFORT, Optimizer, Optimum, maximise
+from pyro_dynogp.inference.optimise.maximum import EFFORT, Effort, Optimizer, Optimum, maximise
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.plans import (
@@ -26,9 +26,9 @@ from pyro_dynogp.inference.starts.plans import (
 from pyro_dynogp.inference.starts.poles import grown, starting_values
 from pyro_dynogp.layers.noise import TYPICAL
 from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.prepared import PreparedRecord, Records, as_measured
 from pyro_dynogp.models.variants import without_noise_below_functions
 from pyro_dynogp.models.wiring import Dynamic
-from pyro_dynogp.support.checkpoints import NOTHING_KEPT, Checkpoints
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import seeded
@@ -42,41 +42,35 @@ UNEXPLAINED = 0.5
 
 def starting_points(
     model: Model,
-    records: Sequence[Record],
+    records: Sequence[PreparedRecord],
+    run: Run,
+    *,
     count: int,
     steps: int,
-    seed: int,
-    workers: int | None,
-    progress: bool,
-    checkpoints: Checkpoints,
 ) -> list[Values]:
     """Values of every site for each restart, from the optima of linear fits."""
-    assert model.scaling is not None
+    scaling = records[0].scaling
     optima: dict[str, Sequence[Values]] = {}
     known: dict[Any, Sequence[Values]] = {}
     for one in leading_layers(model):
         assert isinstance(one.layer, Dynamic)
-        twin = linear_twin(model, one.layer, model.scaling)
-        if twin not in known:
-            training = _one_output(records) if twin.outputs < model.outputs else tuple(records)
-            twin = twin.scaled_to(training)
+        linear = linear_twin(model, one.layer, scaling)
+        if linear not in known:
+            training = tuple(records) if linear.outputs == model.outputs else _one_output(records)
+            twin = replace(linear, scaling=training[0].scaling)
             found = maximise(
                 twin,
-                training if len(training) > 1 else training[0],
-                starting_values(twin, training, count=LINEAR_STARTS, seed=seed),
+                training,
+                starting_values(twin, training, count=LINEAR_STARTS, seed=run.seed),
+                run,
                 steps=min(LINEAR_STEPS, steps),
-                seed=seed,
-                workers=workers,
-                progress=progress,
-                checkpoints=checkpoints,
                 key=f"linear-{one.name}",
             )
-            known[twin] = [optimum.values for optimum in found]
-        optima[one.name] = known[twin]
-    with seeded(seed):  # what has no typical value is drawn
+            known[linear] = [optimum.values for optimum in found]
+        optima[one.name] = known[linear]
+    with seeded(run.seed):  # what has no typical value is drawn
         return [
-            starting_point(model, records, model.scaling, plan)
-            for plan in plans(model, optima, count, seed)
+            starting_point(model, records, plan) for plan in plans(model, optima, count, run.seed)
         ]
 
 
@@ -93,8 +87,11 @@ def _louder(values: Values) -> Values:
     }
 
 
-def _one_output(records: Sequence[Record]) -> tuple[Record, ...]:
-    return tuple(record.select(outputs=[record.output_names[0]]) for record in records)
+def _one_output(records: Sequence[PreparedRecord]) -> tuple[PreparedRecord, ...]:
+    names = [records[0].record.output_names[0]]
+    selected = [each.record.select(outputs=names) for each in records]
+    scaling = Scaling.from_records(selected)
+    return tuple(PreparedRecord.of(record, scaling) for record in selected)
 
 
 @dataclass(frozen=True)
@@ -155,24 +152,17 @@ def best_optima(
     model, records, learnt = problem.model, problem.records, problem.learnt
     optimizer = optimizer or ("adam" if model.has_function else "lbfgs")
     restarts = run.restarts or (8 if model.has_function else 6)
-    options: dict[str, Any] = {
-        "optimizer": optimizer, "seed": run.seed, "workers": run.workers,
-        "progress": run.progress, "checkpoints": run.checkpoints,
-    }  # fmt: skip
     if model.is_linear:
         starts = starting_values(model, records, count=restarts, seed=run.seed)
         if learnt is not None:
             starts = [grown(learnt, starts[0]), *starts]
         steps = steps or (1500 if optimizer == "adam" else 500)
-        optima = maximise(problem.target, problem.argument, starts, steps=steps, **options)
+        optima = maximise(problem.target, records, starts, run, steps=steps, optimizer=optimizer)
     else:
         steps = steps or 600
-        starts = starting_points(
-            problem.target, records, restarts, steps, run.seed, run.workers, run.progress,
-            run.checkpoints,
-        )  # fmt: skip
+        starts = starting_points(problem.target, records, run, count=restarts, steps=steps)
         warm = [] if learnt is None else [grown(learnt, starts[0])]
-        optima = climb(problem.target, problem.argument, starts, warm, steps=steps, **options)
+        optima = climb(problem.target, records, starts, warm, run, steps=steps, optimizer=optimizer)
     if optima[0].energy >= WALL:
         raise ValueError(
             "fit: no start reached a point where the likelihood can be evaluated. Check the "
@@ -181,9 +171,7 @@ def best_optima(
     return optima
 
 
-def at_optimum(
-    model: Model, optima: Sequence[Optimum], seed: int, records: Sequence[Record]
-) -> Fitted:
+def at_optimum(model: Model, optima: Sequence[Optimum], seed: int, records: Records) -> Fitted:
     """The fit that the best of several optima is: a posterior mode."""
     best = optima[0]
     return Fitted(
@@ -195,19 +183,20 @@ def at_optimum(
         start_energies=np.array([optimum.energy for optimum in optima]),
         diagnostics=FrozenMapping({"iterations": float(len(best.history))}),
         seed=seed,
-        records=tuple(records),
+        records=as_measured(records),
     )
 
 
 def climb(
     model: Model,
-    records: Record | Sequence[Record],
+    records: Records,
     starts: Sequence[Values],
     learnt: Sequence[Values],
+    run: Run,
     *,
     steps: int,
-    checkpoints: Checkpoints = NOTHING_KEPT,
-    **options: Any,
+    optimizer: Optimizer,
+    effort: Effort = EFFORT,
 ) -> list[Optimum]:
     """Optima of the collapsed model from fresh starts and from what is learnt, best first.
 
@@ -216,34 +205,38 @@ def climb(
     explain all that dynamics and functions should: from a poor start to a high density and poor
     forecasts.
     """
-    options["checkpoints"] = checkpoints
-    options["effort"] = replace(options.get("effort", EFFORT), kept=0.5)
+    effort = replace(effort, kept=0.5)
+
+    def optima_of(target: Model, points: Sequence[Values], key: str) -> list[Optimum]:
+        return maximise(
+            target, records, points, run, optimizer=optimizer, steps=steps, key=key, effort=effort
+        )
+
     quiet = without_noise_below_functions(model)
     if quiet != model and starts:
         steps = max(1, steps // 2)
-        key = "without-process-noise"
-        louder = [_louder(start) for start in starts]
-        found = maximise(quiet, records, louder, steps=steps, key=key, **options)
+        found = optima_of(quiet, [_louder(start) for start in starts], "without-process-noise")
         better = found[: (len(starts) + 1) // 2]
         starts = [grown(one.values, starts[0]) for one in better]
-    return maximise(model, records, [*learnt, *starts], steps=steps, key="cascade", **options)
+    return optima_of(model, [*learnt, *starts], "cascade")
 
 
 def grow(
-    model: Model, record: Record, learnt: Values, start: Values, *, steps: int, seed: int
+    model: Model, records: Records, learnt: Values, start: Values, run: Run, *, steps: int
 ) -> list[Optimum]:
     """Optima of the collapsed model near what a smaller model, or the same one, has learnt.
 
     Process noise that has explained what the smaller model lacks keeps the larger one from
     explaining it: one climb goes without any first, and takes that of `start` then.
     """
-    options: dict[str, Any] = {
-        "steps": steps, "seed": seed, "workers": 1, "optimizer": "preconditioned",
-    }  # fmt: skip
+
+    def climbed(target: Model, point: Values, key: str) -> Optimum:
+        return maximise(
+            target, records, [point], run, optimizer="preconditioned", steps=steps, key=key
+        )[0]
+
     starts = [learnt]
     quiet = without_noise_below_functions(model)
     if quiet != model:
-        (found, *_) = maximise(quiet, record, [_louder(learnt)], key="grown-quiet", **options)
-        starts.append(grown(found.values, start))
-    optima = [maximise(model, record, [one], key="grown", **options)[0] for one in starts]
-    return sorted(optima, key=lambda one: one.energy)
+        starts.append(grown(climbed(quiet, _louder(learnt), "grown-quiet").values, start))
+    return sorted((climbed(model, point, "grown") for point in starts), key=lambda o: o.energy)

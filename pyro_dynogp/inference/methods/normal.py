@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,9 +15,9 @@ from pyro.infer.autoguide import AutoDiagonalNormal, AutoMultivariateNormal, ini
 from torch import Tensor
 
 from pyro_dynogp.inference.density import Potential
-from pyro_dynogp.inference.methods.svi import train
+from pyro_dynogp.inference.methods.svi import Schedule, train
 from pyro_dynogp.inference.posteriors import Mixture
-from pyro_dynogp.support.checkpoints import NOTHING_KEPT, Checkpoints
+from pyro_dynogp.inference.run import Run
 
 # Divergence of Laplace's approximation from the posterior [nats] that SVI does not mend, the draws
 # that it is found from, and what is said then.
@@ -64,15 +64,11 @@ def variational(
     model: Any,
     args: tuple[Any, ...],
     values: dict[str, Tensor],
+    run: Run,
+    schedule: Schedule,
     *,
-    steps: int = 1000,
-    particles: int = 8,
-    learning_rate: float = 0.02,
-    seed: int = 0,
     independent: bool = False,
-    checkpoints: Checkpoints = NOTHING_KEPT,
     key: str = "posterior",
-    progress: bool = False,
 ) -> VariationalPosterior:
     """Fit a multivariate normal to the posterior by Pyro's SVI, from values near its mode.
 
@@ -83,18 +79,16 @@ def variational(
     """
     potential = Potential(model, args, values)
     if independent:
-        return _independent(
-            potential, steps, particles, learning_rate, seed, checkpoints, key, progress
-        )
+        return _independent(potential, run, schedule, key)
 
     def laplace() -> dict[str, Tensor]:
         centre, root = potential.laplace(values, widest=2.0)
         return {"centre": torch.as_tensor(centre), "root": torch.as_tensor(root)}
 
-    found = checkpoints.piece(f"{key}-laplace", laplace)
+    found = run.checkpoints.piece(f"{key}-laplace", laplace)
     centre, root = found["centre"], found["root"]
-    weights = checkpoints.piece(
-        f"{key}-weights", lambda: {"log": log_weights(potential, centre, root, seed)}
+    weights = run.checkpoints.piece(
+        f"{key}-weights", lambda: {"log": log_weights(potential, centre, root, run.seed)}
     )["log"]
     if 0.5 * float(weights.var()) <= CLOSE:
         elbo = np.array([float(weights.mean())])
@@ -102,18 +96,17 @@ def variational(
     start = {name: value.detach() for name, value in potential.unpack(centre).items()}
     guide = PreconditionedNormal(model, centre, root, init_loc_fn=init_to_value(values=start))
     order = [site.name for site in potential.sites]
-    loss = Trace_ELBO(num_particles=particles, vectorize_particles=True, max_plate_nesting=0)
+    loss = Trace_ELBO(
+        num_particles=schedule.particles, vectorize_particles=True, max_plate_nesting=0
+    )
     with pyro.get_param_store().scope(), pyro.validation_enabled(False):
         trained = train(
             model,
             guide,
             args,
             loss,
-            steps=steps,
-            learning_rate=learning_rate,
-            seed=seed,
-            checkpoints=checkpoints,
-            progress=progress,
+            run,
+            schedule,
             key=f"{key}-svi",
         )
         names = list(guide._unconstrained_shapes)
@@ -139,31 +132,26 @@ def log_weights(potential: Potential, centre: Tensor, root: Tensor, seed: int) -
 
 def _independent(
     potential: Potential,
-    steps: int,
-    particles: int,
-    learning_rate: float,
-    seed: int,
-    checkpoints: Checkpoints,
+    run: Run,
+    schedule: Schedule,
     key: str,
-    progress: bool,
 ) -> VariationalPosterior:
     """A normal with diagonal covariance, narrow at first: ridges are thin."""
     values = {name: v.detach() for name, v in potential.at.items()}
     guide = AutoDiagonalNormal(
         potential.model, init_loc_fn=init_to_value(values=values), init_scale=0.003
     )
-    loss = Trace_ELBO(num_particles=particles, vectorize_particles=True, max_plate_nesting=0)
+    loss = Trace_ELBO(
+        num_particles=schedule.particles, vectorize_particles=True, max_plate_nesting=0
+    )
     with pyro.get_param_store().scope(), pyro.validation_enabled(False):
         trained = train(
             potential.model,
             guide,
             potential.args,
             loss,
-            steps=steps,
-            learning_rate=0.2 * learning_rate,
-            seed=seed,
-            checkpoints=checkpoints,
-            progress=progress,
+            run,
+            replace(schedule, learning_rate=0.2 * schedule.learning_rate),
             key=f"{key}-svi",
         )
         posterior = guide.get_posterior().base_dist

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +14,6 @@ from pyro.infer import MCMC, NUTS
 from pyro.ops.stats import effective_sample_size, split_gelman_rubin
 from torch import Tensor
 
-from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.cascade_coordinates import potential_for_sampling
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.methods.base import Problem
@@ -23,6 +22,7 @@ from pyro_dynogp.inference.optimise.maximum import Optimizer
 from pyro_dynogp.inference.posteriors import Sampled
 from pyro_dynogp.inference.run import Run, at_least_one
 from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.prepared import Records, as_measured
 from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import child_seeds, parallel_map, seeded
 
@@ -85,14 +85,12 @@ class Nuts:
         best = optima[0]
         chain = sample_posterior(
             problem.target,
-            problem.argument,
+            problem.records,
             best.values,
+            run,
             chains=self.chains,
             draws=self.draws,
             warmup=self.warmup,
-            seed=run.seed,
-            workers=run.workers,
-            progress=run.progress,
         )
         diagnostics = {"divergences": float(chain.divergences), "chains": float(self.chains),
                        "warmup": float(self.warmup)}  # fmt: skip
@@ -110,14 +108,14 @@ class Nuts:
             start_energies=np.array([optimum.energy for optimum in optima]),
             diagnostics=FrozenMapping(diagnostics),
             seed=run.seed,
-            records=problem.records,
+            records=as_measured(problem.records),
         )
 
 
 @dataclass(frozen=True)
 class _Task:
     model: Any
-    records: Record | Sequence[Record]
+    records: Records
     values: dict[str, Tensor]
     centre: np.ndarray
     root: np.ndarray
@@ -183,16 +181,14 @@ def within_reach(energy: Callable[[dict[str, Tensor]], Tensor], start: Tensor) -
 
 def sample_posterior(
     model: Any,
-    records: Record | Sequence[Record],
+    records: Records,
     values: dict[str, Tensor],
+    run: Run,
     *,
     chains: int = 4,
     draws: int = 500,
     warmup: int = 500,
     target_accept: float = 0.8,
-    seed: int = 0,
-    workers: int | None = None,
-    progress: bool = False,
 ) -> Chains:
     """Run NUTS from around the posterior mode `values`.
 
@@ -214,11 +210,11 @@ def sample_posterior(
             warmup,
             target_accept,
             child,
-            progress and i == 0,
+            run.progress and i == 0,
         )
-        for i, child in enumerate(child_seeds(seed, chains))
+        for i, child in enumerate(child_seeds(run.seed, chains))
     ]
-    results = parallel_map(_run_chain, tasks, workers=workers)
+    results = parallel_map(_run_chain, tasks, workers=run.workers)
     drawn = torch.stack([x for x, _ in results])
     with torch.no_grad():
         sites = {k: v.contiguous() for k, v in potential.unpack(drawn).items()}

@@ -17,7 +17,8 @@ from pyro.poutine.runtime import _PYRO_PARAM_STORE
 from torch import Tensor
 from tqdm import tqdm
 
-from pyro_dynogp.support.checkpoints import Checkpoints, Piece
+from pyro_dynogp.inference.run import Run
+from pyro_dynogp.support.checkpoints import Piece
 from pyro_dynogp.support.parallel import seeded
 
 # Steps without a rise after which training ends.
@@ -55,6 +56,19 @@ class TrainingDivergedError(ValueError):
 
 
 @dataclass(frozen=True)
+class Schedule:
+    """How long and how finely SVI trains.
+
+    Attributes:
+        steps: most of them. particles: draws of a step. learning_rate: the first one.
+    """
+
+    steps: int = 1000
+    particles: int = 8
+    learning_rate: float = 0.02
+
+
+@dataclass(frozen=True)
 class Trained:
     """Result of `train`.
 
@@ -74,12 +88,9 @@ def train(
     guide: Callable[..., Any],
     args: tuple[Any, ...],
     loss: Any,
+    run: Run,
+    schedule: Schedule,
     *,
-    steps: int,
-    learning_rate: float,
-    seed: int,
-    checkpoints: Checkpoints,
-    progress: bool,
     key: str = "svi",
     rise: float = 0.05,
     layers: Mapping[str, str] = MappingProxyType({}),
@@ -96,7 +107,8 @@ def train(
         TrainingDivergedError: where the ELBO is not a number or cannot be computed; it names the
             parameters concerned and holds the last good state.
     """
-    settings = {"lr": learning_rate, "lrd": 0.1 ** (1.0 / steps), "clip_norm": 10.0}
+    steps = schedule.steps
+    settings = {"lr": schedule.learning_rate, "lrd": 0.1 ** (1.0 / steps), "clip_norm": 10.0}
     optimizer = ClippedAdam(settings)
     svi = SVI(model, guide, optimizer, loss)
     elbo: list[float] = []
@@ -104,7 +116,7 @@ def train(
     live = True  # whether store and optimiser are where `state` says
     best, best_step = -np.inf, 0
     message = "all steps used"
-    with tqdm(total=steps, desc=key, disable=not progress) as bar, seeded(seed):
+    with tqdm(total=steps, desc=key, disable=not run.progress) as bar, seeded(run.seed):
         while len(elbo) < steps:
             first, count = len(elbo), min(CHUNK, steps - len(elbo))
             before, ready = state, live
@@ -120,7 +132,7 @@ def train(
                 live = True
                 return {**_state(optimizer), "elbo": torch.tensor(values, dtype=torch.float64)}
 
-            state = checkpoints.piece(f"{key}-{first + count:07d}", advance)
+            state = run.checkpoints.piece(f"{key}-{first + count:07d}", advance)
             elbo.extend(state["elbo"].tolist())
             bar.update(count)
             smoothed = float(np.mean(elbo[-CHUNK:]))

@@ -11,18 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pyro_dynogp.data.record import Record
-from pyro_dynogp.data.records import as_records
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.optimise.descent import descend, lbfgs
 from pyro_dynogp.inference.optimise.lockstep import Functions, in_lockstep
-from pyro_dynogp.support.checkpoints import (
-    NOTHING_KEPT,
-    Checkpoints,
-    Piece,
-    tensor_text,
-    text_tensor,
-)
+from pyro_dynogp.inference.run import Run
+from pyro_dynogp.models.prepared import Records, as_measured
+from pyro_dynogp.support.checkpoints import Piece, tensor_text, text_tensor
 from pyro_dynogp.support.parallel import parallel_map, seeded
 
 Optimizer = Literal["lbfgs", "preconditioned", "adam"]
@@ -76,12 +70,11 @@ class _Task:
     """Starts that climb together; `goes_on` says that they have climbed already."""
 
     model: Any
-    records: Record | Sequence[Record]
+    records: Records
     starts: tuple[dict[str, Tensor], ...]
     optimizer: Optimizer
     steps: int
-    seed: int
-    checkpoints: Checkpoints
+    run: Run
     key: str
     rate: float
     goes_on: bool
@@ -150,11 +143,11 @@ _METHODS = {"lbfgs": _lbfgs, "preconditioned": _preconditioned, "adam": _adam}
 
 
 def _optimise(task: _Task) -> list[Optimum]:
-    return _unpack(task.checkpoints.piece(task.key, lambda: _pack(_climb(task))))
+    return _unpack(task.run.checkpoints.piece(task.key, lambda: _pack(_climb(task))))
 
 
 def _climb(task: _Task) -> list[Optimum]:
-    with seeded(task.seed):
+    with seeded(task.run.seed):
         potential = Potential(task.model, (task.records,), task.starts[0])
         method = _METHODS[task.optimizer]
         every = potential.hessian_cost  # of a climb, Hessians are at most half the work
@@ -200,11 +193,11 @@ def _unpack(piece: Piece) -> list[Optimum]:
 def _batches(
     starts: Sequence[dict[str, Tensor]],
     model: Any,
-    records: Record | Sequence[Record],
+    records: Records,
     together: int,
 ) -> list[tuple[dict[str, Tensor], ...]]:
     """Starts in batches of nearly one size."""
-    outputs = sum(len(one) * max(one.n_outputs, 1) for one in as_records(records))
+    outputs = sum(len(one) * max(one.n_outputs, 1) for one in as_measured(records))
     pays = BATCH_SAMPLES // outputs if getattr(model, "takes_batches", False) else 1
     count = -(-len(starts) // max(1, min(together, pays)))
     edges = np.linspace(0, len(starts), count + 1).round().astype(int)
@@ -213,15 +206,12 @@ def _batches(
 
 def maximise(
     model: Any,
-    records: Record | Sequence[Record],
+    records: Records,
     starts: Sequence[dict[str, Tensor]],
+    run: Run,
     *,
     optimizer: Optimizer = "lbfgs",
     steps: int = 500,
-    seed: int = 0,
-    workers: int | None = None,
-    progress: bool = False,
-    checkpoints: Checkpoints = NOTHING_KEPT,
     key: str = "optimum",
     effort: Effort = EFFORT,
 ) -> list[Optimum]:
@@ -241,8 +231,7 @@ def maximise(
                 batch,
                 optimizer,
                 count,
-                seed,
-                checkpoints,
+                run,
                 f"{key}-{label}-{i}",
                 effort.rate,
                 effort.near or label == "optima",
@@ -252,8 +241,8 @@ def maximise(
         found = parallel_map(
             _optimise,
             tasks,
-            workers=workers,
-            progress=progress,
+            workers=run.workers,
+            progress=run.progress,
             description=f"{len(values)} {label}",
             news=lambda done: f"log p {-min(o.energy for batch in done for o in batch):.2f}",
         )

@@ -15,11 +15,11 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.data.records import as_records
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.optimise.lockstep import Functions, in_lockstep
 from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.prepared import as_measured
 from pyro_dynogp.support.tensors import as_tensor
 
 Result = TypeVar("Result")
@@ -136,7 +136,7 @@ def _is_scaled(model: Any) -> TypeGuard[Model]:
 
 
 def _records(potential: Potential) -> tuple[Record, ...]:
-    return as_records(potential.args[0])
+    return as_measured(potential.args[0])
 
 
 def _inputs(potential: Potential, scaling: Scaling) -> list[Tensor]:
