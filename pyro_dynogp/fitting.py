@@ -227,6 +227,7 @@ def fit(
     """
     chosen = method_of(method, model, options)
     run = Run(seed, workers, progress, restarts=restarts, steps=steps)
+    chosen.check(model, warm=start is not None)
     problem = Problem.of(model, record, start)
     return Fit.of(train_model(problem, chosen, run, checkpoint))
 

@@ -30,9 +30,6 @@ if TYPE_CHECKING:
 Values = Mapping[str, Tensor]
 # Draws that `check` and `loo` take where they are not told: the same, so that their k agree.
 DRAWS = 1000
-# Widest standard deviation of a Laplace approximation, in unconstrained units, where the density
-# is flat: priors are about as wide.
-WIDEST = 1.5
 # Samples times draws that are evaluated at once.
 AT_ONCE = 4_000_000
 
@@ -140,8 +137,8 @@ def judged(fit: Fitted, draws: Draws, kind: str | None = None) -> PosteriorDraws
 def laplace(fit: Fitted, values: Values) -> Mixture:
     """Normal around an optimum, from the Hessian of the log joint density there."""
     with seeded(fit.seed):
-        potential = Potential(fit.model.collapsed, (_argument(fit.records),), values)
-        centre, root = potential.laplace(values, widest=WIDEST)
+        potential = Potential(fit.model.collapsed, (fit.model.prepare(fit.records),), values)
+        centre, root = potential.laplace(values)
     return Mixture.normal(potential, torch.as_tensor(centre), torch.as_tensor(root))
 
 
@@ -169,7 +166,7 @@ def _annealed(
         )
     normal = normal_of(fit)
     z, start = annealing.around(normal, count, seed)
-    target = annealing.Joint(fit.model.collapsed, (_argument(fit.records),), normal.sites)
+    target = annealing.Joint(fit.model.collapsed, (fit.model.prepare(fit.records),), normal.sites)
     with seeded(seed):
         annealed = annealing.anneal(z, start, target, seed=seed, progress=progress)
         values = FrozenMapping(normal.at_latent(annealed.z))
@@ -186,7 +183,7 @@ def _annealed(
 def log_joint(fit: Fitted, values: Values) -> np.ndarray:
     """Log p(y, values) (S,) of draws, y the training records; -inf where it has no value."""
     return log_joint_of(
-        fit.model.collapsed, (_argument(fit.records),), values, _samples(fit.records)
+        fit.model.collapsed, (fit.model.prepare(fit.records),), values, _samples(fit.records)
     )
 
 
@@ -230,10 +227,6 @@ def _portion(model: Any, args: tuple[Any, ...], values: Values) -> np.ndarray:
             raise invalid("values", expected=f"draws of every site, {name!r} too", got="none of it")
     total = log_prob_by_draw(trace, count).numpy()
     return np.where(np.isfinite(total), total, -np.inf)
-
-
-def _argument(records: Sequence[Record]) -> Any:
-    return records[0] if len(records) == 1 else tuple(records)
 
 
 def _samples(records: Sequence[Record]) -> int:

@@ -208,7 +208,9 @@ def _method(
         loose["draws"] = -(-THIN * draws // loose.get("chains", 4))
     elif name == "svi":
         loose["draws"] = draws
-    return method_of(name, model, loose), run, None if start is None else dict(start.mode)
+    chosen = method_of(name, model, loose)
+    chosen.check(model, warm=start is not None)
+    return chosen, run, None if start is None else dict(start.mode)
 
 
 def _fitted(task: _Task, record: Record) -> Fitted:

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.distributions import biject_to
 from torch.distributions.transforms import Transform
 
-from pyro_dynogp.inference.optimise.descent import bounded_root, descend, hessian
+from pyro_dynogp.inference.optimise.descent import WIDEST, bounded_root, descend, hessian
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
 from pyro_dynogp.support.errors import invalid
 
@@ -263,21 +263,19 @@ class Potential:
         """Energies (k,) and gradients (k, d) of the unconstrained vector's density."""
         return self.values_and_gradients(z, jacobian=True)
 
-    def log_evidence(self, values: Mapping[str, Tensor], *, widest: float) -> float:
+    def log_evidence(self, values: Mapping[str, Tensor]) -> float:
         """Laplace's approximation of log p(y) from the neighbourhood of `values` alone [nats].
 
         A Gaussian integral of the unconstrained vector's density with the curvature there: by it
         optima of one model are compared, of which a high one may be a needle. Directions that are
-        flatter than a standard deviation of `widest` count as that wide (Tierney & Kadane 1986).
+        flatter than a standard deviation of `WIDEST` count as that wide (Tierney & Kadane 1986).
         """
         z = self.pack(values).numpy()
         energy = self.value_and_gradient(z, jacobian=True)[0]
-        curvature = np.maximum(np.linalg.eigvalsh(self.hessian(z, step=1e-3)), widest**-2)
+        curvature = np.maximum(np.linalg.eigvalsh(self.hessian(z, step=1e-3)), WIDEST**-2)
         return float(-energy - 0.5 * np.log(curvature / (2.0 * math.pi)).sum())
 
-    def laplace(
-        self, values: Mapping[str, Tensor], *, widest: float
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def laplace(self, values: Mapping[str, Tensor]) -> tuple[np.ndarray, np.ndarray]:
         """Centre (d,) and root (d, d) of the Laplace approximation of the unconstrained vector.
 
         The centre is the mode of that vector's own density (with Jacobian), climbed to from
@@ -287,7 +285,7 @@ class Potential:
         z, _, _ = descend(
             self.with_jacobian, self.pack(values).numpy(), LAPLACE_STEPS, every=every, first=0
         )
-        return z, bounded_root(self.hessian(z), widest=widest)
+        return z, bounded_root(self.hessian(z))
 
 
 # Unconstrained value of what lies on a boundary: within 1e-13 of it.

@@ -1,4 +1,4 @@
-"""From a problem to a fitted model: the method is checked, then it runs."""
+"""From a problem to a fitted model, its finished pieces kept in a folder."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ def train_model(
     Args:
         problem: what is fitted to what. method, run: how. checkpoint: a folder for finished pieces.
     """
-    method.check(problem.model, warm=problem.learnt is not None)
     kept = Checkpoints.at(
         checkpoint,
         *problem.identity,

@@ -85,7 +85,7 @@ def one_replicate(task: _Task) -> dict[str, int]:
         start = starting_values(model, records, count=1, seed=task.seed)
         optimum = maximise(model, records, start, Run(task.seed, workers=1), steps=60)[0]
         potential = Potential(model, (records,), truth)
-        centre, root = potential.laplace(optimum.values, widest=3.0)
+        centre, root = potential.laplace(optimum.values)
         middle, scale = torch.as_tensor(centre), torch.as_tensor(root)
 
         def energy(parameters: dict[str, torch.Tensor]) -> torch.Tensor:

@@ -77,7 +77,7 @@ def test_a_dead_time_has_the_posterior_that_fits_at_every_number_of_samples_give
         model = replace(fit.model, channels=(replace(channel, delay=float(delay)),))
         (best,) = maximise(model, record, [dict(fit.mode)], Run(workers=1), steps=200)
         potential = Potential(model, (record,), best.values)
-        heights.append(potential.log_evidence(best.values, widest=3.0))
+        heights.append(potential.log_evidence(best.values))
     share = np.exp(np.array(heights) - max(heights))
     share /= share.sum()
     # A number of samples stands for all delays in the step before it.

@@ -57,7 +57,7 @@ def test_where_it_is_not_svi_raises_the_elbo():
     assert found.message != AS_GOOD
     assert len(found.elbo) > 50
     potential = Potential(skewed, (Y,), start)
-    centre, root = (torch.as_tensor(x) for x in potential.laplace(start, widest=2.0))
+    centre, root = (torch.as_tensor(x) for x in potential.laplace(start))
     many = torch.cat([log_weights(potential, centre, root, seed) for seed in range(40)])
     assert 0.5 * many.var() > CLOSE
     assert found.elbo[-50:].mean() > many.mean()
@@ -66,7 +66,7 @@ def test_where_it_is_not_svi_raises_the_elbo():
 def test_log_weights_are_the_divergence_of_a_wrong_normal():
     """Of a normal that is too wide by known factors: KL in closed form, and half the variance."""
     potential = Potential(normal, (Y,), {"w": torch.zeros(2, dtype=torch.float64)})
-    centre, root = potential.laplace({"w": torch.zeros(2, dtype=torch.float64)}, widest=2.0)
+    centre, root = potential.laplace({"w": torch.zeros(2, dtype=torch.float64)})
     wide = torch.as_tensor(root) * 1.1
     many = torch.cat([
         log_weights(potential, torch.as_tensor(centre), wide, seed) for seed in range(60)

@@ -377,7 +377,7 @@ class TestBeginning:
         x0 = torch.tensor([0.5 - 0.6j], dtype=torch.complex128)
         record, g = wiener_data(fit, n=60, x0=x0)
         modes = fit.system.layer("g").modes[0]
-        z = estimate(fit, record)["g"]
+        z = estimate(fit, PreparedRecord.of(record, fit.scaling))["g"]
         found = fit.model.begin(fit.system, {"g": z}).layer("g").first_state[0]
         u = PreparedRecord.of(record, fit.scaling).scaled_inputs
         response = dgp.LTIProcess(modes, record.time, u, found).mean.numpy()

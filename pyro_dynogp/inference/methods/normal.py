@@ -82,7 +82,7 @@ def variational(
         return _independent(potential, run, schedule, key)
 
     def laplace() -> dict[str, Tensor]:
-        centre, root = potential.laplace(values, widest=2.0)
+        centre, root = potential.laplace(values)
         return {"centre": torch.as_tensor(centre), "root": torch.as_tensor(root)}
 
     found = run.checkpoints.piece(f"{key}-laplace", laplace)

@@ -198,7 +198,7 @@ def sample_posterior(
     (`within_reach`).
     """
     potential = potential_for_sampling(model, (records,), values)
-    z, root = potential.laplace(values, widest=3.0)
+    z, root = potential.laplace(values)
     tasks = [
         _Task(
             model,

@@ -35,9 +35,6 @@ Hyperparameters = Literal["map", "normal", "multivariate normal"]
 MOST_OPTIMA = 4
 # Least weight of one that counts.
 LEAST_WEIGHT = 0.05
-# Largest standard deviation of a direction in the evidence of an optimum (unconstrained units):
-# about twice that of the priors.
-WIDEST = 3.0
 # Iterations of SVI around optima that are found already.
 POLISH = 60
 
@@ -179,7 +176,7 @@ class _Around:
 
         def compute() -> Piece:
             potential = Potential(self.problem.target, (self.problem.records,), self.free)
-            found = potential.log_evidence(self.free, widest=WIDEST)
+            found = potential.log_evidence(self.free)
             return {"evidence": torch.tensor(found, dtype=torch.float64)}
 
         return float(self.run.checkpoints.piece(self.key, compute)["evidence"])
