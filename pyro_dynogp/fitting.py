@@ -56,7 +56,7 @@ class Fit(Fitted):
 
     def log_likelihood(self, records: Record | Sequence[Record]) -> np.ndarray:
         """Log p(y | draw) (S,) [nats], exact marginal likelihood in the units of the record."""
-        total: Any = 0.0
+        total = torch.zeros((), dtype=torch.float64)
         with torch.no_grad():
             for record in self.model.prepare(records):
                 outputs = output_process(beginning(self, record), record)

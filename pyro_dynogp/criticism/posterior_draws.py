@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyro
@@ -19,6 +19,7 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.density import Potential, log_prob_by_draw
 from pyro_dynogp.inference.methods import annealed as annealing
 from pyro_dynogp.inference.posteriors import Draws, Mixture
+from pyro_dynogp.layers.sites import Arguments, Program
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
@@ -188,7 +189,7 @@ def log_joint(fit: Fitted, values: Values) -> np.ndarray:
 
 
 def log_joint_of(
-    model: Any, args: tuple[Any, ...], values: Values, samples: int = 1000
+    model: Program, args: Arguments, values: Values, samples: int = 1000
 ) -> np.ndarray:
     """Log-density (S,) of a Pyro model at S draws of its latent sites, those of the data included.
 
@@ -203,7 +204,7 @@ def log_joint_of(
     return np.concatenate(parts)
 
 
-def _portion(model: Any, args: tuple[Any, ...], values: Values) -> np.ndarray:
+def _portion(model: Program, args: Arguments, values: Values) -> np.ndarray:
     count = len(next(iter(values.values())))
     try:
         with torch.no_grad(), pyro.validation_enabled(False):

@@ -144,7 +144,13 @@ def simulation_based_calibration(
 
 
 def _check(
-    model: Any, record: Any, method: Any, replicates: Any, draws: Any, level: Any, options: Any
+    model: object,
+    record: object,
+    method: object,
+    replicates: object,
+    draws: object,
+    level: object,
+    options: Mapping[str, Any],
 ) -> None:
     if not isinstance(model, Model):
         raise invalid("model", expected="a LinearDynamicGP or a Cascade", got=type(model).__name__)

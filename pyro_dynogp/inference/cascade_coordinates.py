@@ -19,7 +19,6 @@ about zero, prior and likelihood are the same, so that nothing is lost but a mir
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -34,6 +33,7 @@ from pyro_dynogp.inference.cascade_coordinate_steps import (
 )
 from pyro_dynogp.inference.density import Potential, Site, parts
 from pyro_dynogp.layers.functions import StaticFunction
+from pyro_dynogp.layers.sites import Arguments, Program
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.wiring import Dynamic, Static, Wire
 
@@ -46,7 +46,7 @@ class StraightPotential(Potential):
 
     nearly_normal = True
 
-    def __init__(self, model: Model, args: tuple[Any, ...], values: Mapping[str, Tensor]) -> None:
+    def __init__(self, model: Model, args: Arguments, values: Mapping[str, Tensor]) -> None:
         super().__init__(model, args, values)
         self.steps = steps_of(model, Potential(model, args, values))
 
@@ -86,7 +86,7 @@ def by_name(sites: Sequence[Site], z: Tensor) -> Parts:
 
 
 def potential_for_sampling(
-    model: Any, args: tuple[Any, ...], values: Mapping[str, Tensor]
+    model: Program, args: Arguments, values: Mapping[str, Tensor]
 ) -> Potential:
     """The potential of a model in the coordinates that chains are best run in."""
     if isinstance(model, Model) and model.has_function and model.integrate == "all":

@@ -16,6 +16,7 @@ from torch.distributions import biject_to
 from torch.distributions.transforms import Transform
 
 from pyro_dynogp.inference.optimise.descent import WIDEST, bounded_root, descend, hessian
+from pyro_dynogp.layers.sites import Arguments, Program
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
 from pyro_dynogp.support.errors import invalid
 
@@ -63,8 +64,8 @@ def log_prob_by_draw(trace: Any, count: int) -> Tensor:
 
 
 def joint_energy(
-    model: Callable[..., Any],
-    args: tuple[Any, ...],
+    model: Program,
+    args: Arguments,
     sites: Sequence[Site],
     z: Tensor,
     *,
@@ -87,7 +88,7 @@ def joint_energy(
     return -log_joint - log_jacobian
 
 
-def _scored(model: Callable[..., Any], args: tuple[Any, ...], values: Mapping[str, Tensor]) -> Any:
+def _scored(model: Program, args: Arguments, values: Mapping[str, Tensor]) -> Any:
     """Trace of a model at given values, with the log-density of every site."""
     conditioned = pyro.poutine.condition(model, data=dict(values))
     trace = pyro.poutine.trace(conditioned).get_trace(*args)
@@ -152,9 +153,7 @@ class Potential:
 
     nearly_normal = False
 
-    def __init__(
-        self, model: Callable[..., Any], args: tuple[Any, ...], values: Mapping[str, Tensor]
-    ) -> None:
+    def __init__(self, model: Program, args: Arguments, values: Mapping[str, Tensor]) -> None:
         self.model, self.args, self.at = model, args, dict(values)
         trace = pyro.poutine.trace(pyro.poutine.condition(model, data=dict(values))).get_trace(
             *args

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -203,8 +202,9 @@ def draw_layers(
             if not modes.several_outputs:
                 value, mean, variance = (v.unsqueeze(-1) for v in (value, mean, variance))
         else:
+            assert isinstance(one.layer, Static)
             value, mean, variance = _static(
-                one.layer, layer, x, random.residual[one.name], switches
+                one.layer.support, layer, x, random.residual[one.name], switches
             )
             if one.last:
                 value = mean
@@ -216,11 +216,11 @@ def draw_layers(
 
 
 def _static(
-    spec: Any, layer: StaticSystem, x: Tensor, residual: Tensor, switches: Switches
+    support_count: int, layer: StaticSystem, x: Tensor, residual: Tensor, switches: Switches
 ) -> tuple[Tensor, Tensor, Tensor]:
     """One function along x, or its mean; mean and variance at each point."""
     function = layer.function
-    support = support_points(function.locations, spec.support)
+    support = support_points(function.locations, support_count)
     if function.channels > 1:
 
         def at(part: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -25,6 +25,7 @@ from pyro_dynogp.distributions.pointwise import (
     prediction_errors,
 )
 from pyro_dynogp.distributions.process import ConditionedLTIProcess, LTIProcess, ObservedLTIProcess
+from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.state import ModalState, propagate
 from pyro_dynogp.models.draws import JointState
 from pyro_dynogp.models.output_process import Components, LayerMoments, OutputProcess
@@ -92,7 +93,7 @@ class ExactOutputs(OutputProcess):
             if physical.modes.inputs:
                 driving = self.inputs - as_tensor(self.scaling.input_offset)
             # A first state that is known leaves the stationary covariance of process noise.
-            state: Any = start or layer.first_state
+            state: ModalState | Tensor | None = start or layer.first_state
             if state is None:
                 state = replace(layer, modes=physical.modes, past=layer.past_inputs).prior_state()
             process = LTIProcess(physical.modes, self.grid, driving, state, offset=physical.offset)
@@ -286,7 +287,7 @@ class ExactOutputs(OutputProcess):
         return self.process.rsample(sample_shape)
 
 
-def nothing_left(modes: Any) -> ModalState:
+def nothing_left(modes: Modes) -> ModalState:
     """A first state that is zero for certain."""
     J = 2 * modes.pairs
     return ModalState(torch.zeros_like(modes.poles), torch.zeros(J, J, dtype=torch.float64))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal, Self, cast, get_args
+from typing import Literal, Self, TypedDict, cast, get_args
 
 from pyro_dynogp.data.channels import Channel, count_direct, prepared
 from pyro_dynogp.data.record import Record
@@ -19,6 +19,17 @@ from pyro_dynogp.support.errors import invalid
 
 Integrate = Literal["none", "last", "all"]
 InitialState = Literal["auto", "site", "integrated", "zero"]
+
+
+class ModelOptions(TypedDict, total=False):
+    """Arguments of `Model` that every architecture takes by name."""
+
+    initial_state: InitialState
+    integrate: Integrate
+    priors: PriorName
+    direct: int
+    channels: tuple[Channel, ...]
+    scaling: Scaling | None
 
 
 @dataclass(frozen=True)

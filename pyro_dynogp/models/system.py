@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,14 +13,14 @@ from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.layers.functions import StaticFunction
 from pyro_dynogp.layers.noise import Noise
 from pyro_dynogp.lti.covariance import state_covariance
-from pyro_dynogp.lti.grid import time_grid
+from pyro_dynogp.lti.grid import TimeGrid, time_grid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import Response, mean_response
 from pyro_dynogp.lti.state import ModalState
 from pyro_dynogp.models.past_inputs import initial_mean, past_input_covariance, with_direct
 from pyro_dynogp.models.wiring import INPUTS, Wire
 from pyro_dynogp.support.errors import invalid
-from pyro_dynogp.support.tensors import as_tensor, broadcast
+from pyro_dynogp.support.tensors import Numbers, as_tensor, broadcast
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +63,12 @@ class DynamicSystem:
         past = self.past_inputs
         return ModalState(torch.zeros_like(self.modes.poles), state_covariance(self.modes) + past)
 
-    def response(self, x: Tensor, time: Any) -> Response:
+    def response(self, x: Tensor, time: Numbers | TimeGrid) -> Response:
         """What x (*b, n, d) alone causes, from the known first state or rest."""
         driven = x if self.modes.inputs else None
         return mean_response(self.modes, time, driven, self.first_state)
 
-    def mean(self, x: Tensor, time: Any) -> Tensor:
+    def mean(self, x: Tensor, time: Numbers | TimeGrid) -> Tensor:
         """Output (*b, n, w) that x (*b, n, d) alone causes, from the known first state or rest."""
         value = self.response(x, time).output
         return value if self.modes.several_outputs else value.unsqueeze(-1)
@@ -93,7 +92,7 @@ class StaticSystem:
     support: Tensor | None = None
     residual: Tensor | None = None
 
-    def mean(self, x: Tensor, time: Any) -> Tensor:
+    def mean(self, x: Tensor, time: Numbers | TimeGrid) -> Tensor:
         """Mean of the function along x (*b, n, d): (*b, n, e), at whatever times."""
         return self.function.mean(x)
 
@@ -167,7 +166,7 @@ class System:
         direct = inputs[..., -self.direct.shape[-1] :] @ self.direct.mT
         return direct if level is None else level + direct
 
-    def undisturbed(self, inputs: Tensor, time: Any) -> Tensor:
+    def undisturbed(self, inputs: Tensor, time: Numbers | TimeGrid) -> Tensor:
         """Output (*b, n, n_y) that inputs (*b, n, n_u) alone cause, static layers at their mean.
 
         Dynamic layers start from the first state that is known of them, else at rest.
@@ -179,7 +178,7 @@ class System:
         level = self.level(inputs)
         return output if level is None else output + level
 
-    def noise_sd(self, inputs: Tensor, time: Any) -> Tensor:
+    def noise_sd(self, inputs: Tensor, time: Numbers | TimeGrid) -> Tensor:
         """Scale (*b, n, n_y) of the measurement noise along scaled inputs (*b, n, n_u).
 
         Args:

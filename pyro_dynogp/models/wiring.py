@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
+
+from gpytorch.kernels import Kernel
 
 from pyro_dynogp.lti.modes import NoiseStructure
 from pyro_dynogp.support.errors import invalid
@@ -59,7 +61,7 @@ class Static:
 
     outputs: int = 1
     inducing: int = 32
-    kernel: Any = None
+    kernel: Kernel | None = None
     mean: Literal["constant", "linear"] | None = None
     limits: Limits | None = None
     skip: tuple[str, ...] = ()

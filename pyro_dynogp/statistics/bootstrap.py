@@ -264,7 +264,7 @@ def columns_score(
             # The ridge makes columns that the nuisance spans explain nothing.
             inverses.append(np.linalg.inv(G + 1e-8 * np.eye(len(v))))
 
-        def score(x: np.ndarray):
+        def score(x: np.ndarray) -> Scored:
             e0 = whiten(x)[there]
             q = Q.T @ e0
             e = e0 - Q @ q

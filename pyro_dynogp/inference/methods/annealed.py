@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 from pyro_dynogp.inference.density import Site, each_with_gradient, joint_energy
 from pyro_dynogp.inference.posteriors import Mixture
+from pyro_dynogp.layers.sites import Arguments, Program
 
 # Effective share of particles after a step; Hamiltonian moves at each temperature, and at the end.
 EFFECTIVE, MOVES, LAST_MOVES = 0.5, 2, 4
@@ -52,8 +53,8 @@ class Joint:
         model, args: the model and what it is called with. sites: of the vector.
     """
 
-    model: Any
-    args: tuple[Any, ...]
+    model: Program
+    args: Arguments
     sites: Sequence[Site]
 
     def __call__(self, z: Tensor) -> tuple[Tensor, Tensor]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 
@@ -51,7 +51,7 @@ def starting_points(
     """Values of every site for each restart, from the optima of linear fits."""
     scaling = records[0].scaling
     optima: dict[str, Sequence[Values]] = {}
-    known: dict[Any, Sequence[Values]] = {}
+    known: dict[Model, Sequence[Values]] = {}
     for one in leading_layers(model):
         assert isinstance(one.layer, Dynamic)
         linear = linear_twin(model, one.layer, scaling)

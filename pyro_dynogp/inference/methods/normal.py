@@ -18,6 +18,7 @@ from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.methods.svi import Schedule, train
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.run import Run
+from pyro_dynogp.layers.sites import Arguments, Program
 
 # Divergence of Laplace's approximation from the posterior [nats] that SVI does not mend, the draws
 # that it is found from, and what is said then.
@@ -32,15 +33,15 @@ class PreconditionedNormal(AutoMultivariateNormal):
     is the same, but one learning rate suits all coordinates.
     """
 
-    def __init__(self, model: Any, centre: Tensor, root: Tensor, **kwargs: Any) -> None:
+    def __init__(self, model: Program, centre: Tensor, root: Tensor, **kwargs: Any) -> None:
         super().__init__(model, init_scale=1.0, **kwargs)
         self.centre, self.root = centre, root
 
-    def _setup_prototype(self, *args: Any, **kwargs: Any) -> None:
+    def _setup_prototype(self, *args: object, **kwargs: Any) -> None:
         super()._setup_prototype(*args, **kwargs)
         self.loc = torch.nn.Parameter(torch.zeros_like(self.centre))
 
-    def get_posterior(self, *args: Any, **kwargs: Any) -> MultivariateNormal:
+    def get_posterior(self, *args: object, **kwargs: Any) -> MultivariateNormal:
         """Posterior of the unconstrained vector."""
         scale_tril = self.root @ (self.scale[..., None] * self.scale_tril)
         return MultivariateNormal(self.centre + self.root @ self.loc, scale_tril=scale_tril)
@@ -61,8 +62,8 @@ class VariationalPosterior:
 
 
 def variational(
-    model: Any,
-    args: tuple[Any, ...],
+    model: Program,
+    args: Arguments,
     values: dict[str, Tensor],
     run: Run,
     schedule: Schedule,

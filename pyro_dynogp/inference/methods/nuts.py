@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pyro
@@ -21,6 +20,7 @@ from pyro_dynogp.inference.methods.mode import best_optima, check_optimizer
 from pyro_dynogp.inference.optimise.maximum import Optimizer
 from pyro_dynogp.inference.posteriors import Sampled
 from pyro_dynogp.inference.run import Run, at_least_one
+from pyro_dynogp.layers.sites import Program
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import Records, as_measured
 from pyro_dynogp.support.frozen import FrozenMapping
@@ -114,7 +114,7 @@ class Nuts:
 
 @dataclass(frozen=True)
 class _Task:
-    model: Any
+    model: Program
     records: Records
     values: dict[str, Tensor]
     centre: np.ndarray
@@ -180,7 +180,7 @@ def within_reach(energy: Callable[[dict[str, Tensor]], Tensor], start: Tensor) -
 
 
 def sample_posterior(
-    model: Any,
+    model: Program,
     records: Records,
     values: dict[str, Tensor],
     run: Run,

@@ -18,6 +18,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from pyro_dynogp.inference.run import Run
+from pyro_dynogp.layers.sites import Arguments, Program
 from pyro_dynogp.support.checkpoints import Piece
 from pyro_dynogp.support.parallel import seeded
 
@@ -84,9 +85,9 @@ class Trained:
 
 
 def train(
-    model: Callable[..., Any],
-    guide: Callable[..., Any],
-    args: tuple[Any, ...],
+    model: Program,
+    guide: Program,
+    args: Arguments,
     loss: Any,
     run: Run,
     schedule: Schedule,
@@ -150,7 +151,7 @@ def train(
 
 def _step(
     svi: SVI,
-    args: Any,
+    args: Arguments,
     step: int,
     state: Piece | None,
     elbo: list[float],
@@ -177,7 +178,7 @@ def _diverged(
     elbo: list[float],
     before: Mapping[str, Tensor],
     svi: SVI,
-    args: Any,
+    args: Arguments,
     layers: Mapping[str, str],
 ) -> TrainingDivergedError:
     good = before if all(bool(torch.isfinite(p).all()) for p in before.values()) else {}
@@ -206,7 +207,7 @@ def _of(site: str, layer: str) -> bool:
     return any(part == layer or part.startswith(f"{layer}_") for part in site.split("."))
 
 
-def _broken_sites(svi: SVI, args: Any) -> list[str]:
+def _broken_sites(svi: SVI, args: Arguments) -> list[str]:
     """Sites whose value or density is not finite, or cannot be computed, in one run."""
     guide = pyro.poutine.trace(svi.guide)
     with torch.no_grad(), pyro.validation_enabled(False):

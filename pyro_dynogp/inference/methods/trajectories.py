@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pyro
@@ -27,6 +27,7 @@ from pyro_dynogp.inference.methods.trajectory_guide import (
 )
 from pyro_dynogp.inference.posteriors import Sampled
 from pyro_dynogp.inference.run import Run, at_least_one
+from pyro_dynogp.layers.sites import Arguments, Program
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord, as_measured
 from pyro_dynogp.support.checkpoints import Piece
@@ -56,11 +57,11 @@ def _run(task: _Task) -> Piece:
         with pyro.get_param_store().scope(), pyro.validation_enabled(False):
             method = task.method
             own = callable(method.guide) and not isinstance(method.guide, Mapping)
-            guide: Any
-            through: Callable[..., Any]
+            guide: Program
+            through: Program
             if own:
                 # A `LayerGuide` remembers the sites of its first call.
-                guide = copy.deepcopy(method.guide)
+                guide = copy.deepcopy(cast(Program, method.guide))
                 through = guide
                 loss: Any = Trace_ELBO(num_particles=task.schedule.particles)
             else:
@@ -104,7 +105,7 @@ def _pack(trained: Trained, draws: Values, log_q: Values) -> Piece:
 
 
 def _draw(
-    guide: Callable[..., Any], args: Any, count: int, *, vectorised: bool
+    guide: Program, args: Arguments, count: int, *, vectorised: bool
 ) -> tuple[Values, Values]:
     """Draws (S, *shape) of every latent site, and the log-density (S,) of every site's draws."""
 

@@ -15,10 +15,13 @@ from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.optimise.descent import descend, lbfgs
 from pyro_dynogp.inference.optimise.lockstep import Functions, in_lockstep
 from pyro_dynogp.inference.run import Run
+from pyro_dynogp.layers.sites import Program
 from pyro_dynogp.models.prepared import Records, as_measured
 from pyro_dynogp.support.checkpoints import Piece, tensor_text, text_tensor
 from pyro_dynogp.support.parallel import parallel_map, seeded
 
+# End, energies on the way, why it ended.
+Climb = tuple[np.ndarray, list[float], str]
 Optimizer = Literal["lbfgs", "preconditioned", "adam"]
 # Adam's first step, and how often it goes back to the best point with a shorter one.
 RATE, RETURNS = 0.02, 2
@@ -69,7 +72,7 @@ class Optimum:
 class _Task:
     """Starts that climb together; `goes_on` says that they have climbed already."""
 
-    model: Any
+    model: Program
     records: Records
     starts: tuple[dict[str, Tensor], ...]
     optimizer: Optimizer
@@ -80,24 +83,18 @@ class _Task:
     goes_on: bool
 
 
-def _lbfgs(
-    functions: Functions, z: np.ndarray, task: _Task, every: int
-) -> tuple[np.ndarray, list, str]:
+def _lbfgs(functions: Functions, z: np.ndarray, task: _Task, every: int) -> Climb:
     del every  # of Hessians, of which it has none
     history: list[float] = []
     result = lbfgs(functions, z, task.steps, history, maxfun=2 * task.steps, ftol=1e-7)
     return result.x, history, str(result.message)
 
 
-def _preconditioned(
-    functions: Functions, z: np.ndarray, task: _Task, every: int
-) -> tuple[np.ndarray, list, str]:
+def _preconditioned(functions: Functions, z: np.ndarray, task: _Task, every: int) -> Climb:
     return descend(functions, z, task.steps, every=every, first=0 if task.goes_on else None)
 
 
-def _adam(
-    functions: Functions, z: np.ndarray, task: _Task, every: int
-) -> tuple[np.ndarray, list, str]:
+def _adam(functions: Functions, z: np.ndarray, task: _Task, every: int) -> Climb:
     """Adam with a falling step; back to the best point with a shorter one where it got lost.
 
     Its first steps have full length in every direction, however good the start is.
@@ -152,7 +149,7 @@ def _climb(task: _Task) -> list[Optimum]:
         method = _METHODS[task.optimizer]
         every = potential.hessian_cost  # of a climb, Hessians are at most half the work
 
-        def run(start: dict[str, Tensor]) -> Callable[[Functions], tuple[np.ndarray, list, str]]:
+        def run(start: dict[str, Tensor]) -> Callable[[Functions], Climb]:
             z = potential.pack(start).numpy()
             return lambda functions: method(functions, z, task, every)
 
@@ -192,7 +189,7 @@ def _unpack(piece: Piece) -> list[Optimum]:
 
 def _batches(
     starts: Sequence[dict[str, Tensor]],
-    model: Any,
+    model: Program,
     records: Records,
     together: int,
 ) -> list[tuple[dict[str, Tensor], ...]]:
@@ -205,7 +202,7 @@ def _batches(
 
 
 def maximise(
-    model: Any,
+    model: Program,
     records: Records,
     starts: Sequence[dict[str, Tensor]],
     run: Run,
