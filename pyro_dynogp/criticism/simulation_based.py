@@ -122,17 +122,17 @@ def simulation_based_calibration(
         workers=workers,
         progress=progress,
         description="simulation-based calibration",
-        news=lambda done: f"{sum(bool(one.failure) for one in done)} failed",
+        news=lambda done: f"{sum(bool(outcome.failure) for outcome in done)} failed",
     )
-    good = [one for one in outcomes if not one.failure]
-    failures = tuple(one.failure for one in outcomes if one.failure)
+    good = [outcome for outcome in outcomes if not outcome.failure]
+    failures = tuple(outcome.failure for outcome in outcomes if outcome.failure)
     if not good:
         raise invalid(
             "model", expected="a prior to whose data fits can be made",
             got=f"{replicates} replicates that all failed, the first with: {failures[0]}",
         )  # fmt: skip
-    ranks = {name: np.array([one.ranks[name] for one in good]) for name in good[0].ranks}
-    few = sum(one.effective < draws for one in good)
+    ranks = {name: np.array([outcome.ranks[name] for outcome in good]) for name in good[0].ranks}
+    few = sum(outcome.effective < draws for outcome in good)
     notes = []
     if few:
         notes.append(

@@ -28,9 +28,9 @@ def scaled_limits(limits: Limits, scaling: Scaling | None) -> tuple[float, float
             got="None", advice="Use model.scaled_to(record).",
         )  # fmt: skip
     low, high = (
-        sign * math.inf if one is None
-        else (one - float(scaling.output_offset[0])) / float(scaling.output_scale[0])
-        for one, sign in zip(limits, (-1.0, 1.0), strict=True)
+        sign * math.inf if limit is None
+        else (limit - float(scaling.output_offset[0])) / float(scaling.output_scale[0])
+        for limit, sign in zip(limits, (-1.0, 1.0), strict=True)
     )  # fmt: skip
     return low, high
 
@@ -40,7 +40,7 @@ def at_limits(layers: Sequence[Layer], record: Record) -> np.ndarray:
     last = layers[-1]
     if not isinstance(last, Static) or last.limits is None or not record.n_outputs:
         return np.zeros(len(record), dtype=bool)
-    known = [one for one in last.limits if one is not None]
+    known = [limit for limit in last.limits if limit is not None]
     there: np.ndarray = np.isin(record.outputs[:, 0], known)
     return there
 

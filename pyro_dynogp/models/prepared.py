@@ -75,4 +75,6 @@ def _scaled(inputs: Tensor, scaling: Scaling) -> Tensor:
 def as_measured(records: Records) -> tuple[Record, ...]:
     """The records behind what a model is called with."""
     several = (records,) if isinstance(records, Record) else records
-    return tuple(one.record if isinstance(one, PreparedRecord) else one for one in several)
+    return tuple(
+        record.record if isinstance(record, PreparedRecord) else record for record in several
+    )

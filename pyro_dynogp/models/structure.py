@@ -178,9 +178,9 @@ class Structure:
             ValueError: as of `check`; where they are prepared with another scaling.
         """
         ready = [] if isinstance(records, Record) else [
-            one for one in records if isinstance(one, PreparedRecord)]  # fmt: skip
+            record for record in records if isinstance(record, PreparedRecord)]  # fmt: skip
         if not isinstance(records, Record) and ready and len(ready) == len(records):
-            if any(self.scaling not in (None, one.scaling) for one in ready):
+            if any(self.scaling not in (None, record.scaling) for record in ready):
                 expected = "records prepared with the model's scaling"
                 raise invalid("records", expected=expected, got="another scaling")
             return tuple(ready)

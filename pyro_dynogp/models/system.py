@@ -172,8 +172,8 @@ class System:
         Dynamic layers start from the first state that is known of them, else at rest.
         """
         grid, signals = time_grid(time), {INPUTS: self.driving(inputs)}
-        for one, layer in zip(self.wires, self.layers, strict=True):
-            signals[one.name] = layer.mean(see(signals, one), grid)
+        for place, layer in zip(self.wires, self.layers, strict=True):
+            signals[place.name] = layer.mean(see(signals, place), grid)
         output = signals[self.wires[-1].name]
         level = self.level(inputs)
         return output if level is None else output + level
@@ -267,16 +267,16 @@ class System:
         Raises:
             ValueError: where there is no such layer.
         """
-        for one, system in zip(self.wires, self.layers, strict=True):
-            if one.name == name:
+        for place, system in zip(self.wires, self.layers, strict=True):
+            if place.name == name:
                 return system
-        names = [one.name for one in self.wires]
+        names = [place.name for place in self.wires]
         raise invalid("name", expected=f"one of the layers {names}", got=repr(name))
 
 
-def see(signals: dict[str, Tensor], one: Wire) -> Tensor:
+def see(signals: dict[str, Tensor], place: Wire) -> Tensor:
     """What a layer sees (*b, n, channels): its sources side by side."""
-    parts = [signals[name] for name in one.sources]
+    parts = [signals[name] for name in place.sources]
     if len(parts) == 1:
         return parts[0]
     batch = broadcast(*(p.shape[:-2] for p in parts))

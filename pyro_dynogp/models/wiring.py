@@ -216,7 +216,7 @@ def _check_layer(name: str, layer: Layer) -> None:
 
 def _check_limits(name: str, layer: Static, channels: int, last: bool) -> None:
     assert layer.limits is not None
-    known = [one for one in layer.limits if one is not None]
+    known = [limit for limit in layer.limits if limit is not None]
     if len(layer.limits) != 2 or not known or known != sorted(set(known)):
         raise invalid(
             f"limits of layer {name!r}",

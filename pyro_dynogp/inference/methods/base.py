@@ -6,14 +6,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+import numpy as np
 from torch import Tensor
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.posteriors import Posterior
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.prepared import PreparedRecord
+from pyro_dynogp.models.prepared import PreparedRecord, as_measured
+from pyro_dynogp.support.frozen import FrozenMapping
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +64,22 @@ class Problem:
         if self.learnt is None:
             return own
         return (*own, {name: value.tolist() for name, value in self.learnt.items()})
+
+    def fitted(
+        self,
+        run: Run,
+        posterior: Posterior,
+        draws: Mapping[str, Tensor],
+        mode: Mapping[str, Tensor],
+        history: np.ndarray,
+        energies: Sequence[float] | np.ndarray,
+        diagnostics: Mapping[str, float],
+    ) -> Fitted:
+        """The fit that a method has come to; arguments as the fields of `Fitted`."""
+        return Fitted(
+            self.model, posterior, FrozenMapping(draws), FrozenMapping(mode), history,
+            np.asarray(energies), FrozenMapping(diagnostics), run.seed, as_measured(self.records),
+        )  # fmt: skip
 
 
 class Method(Protocol):

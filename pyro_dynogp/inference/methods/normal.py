@@ -11,7 +11,12 @@ import pyro
 import torch
 from pyro.distributions import MultivariateNormal
 from pyro.infer import Trace_ELBO
-from pyro.infer.autoguide import AutoDiagonalNormal, AutoMultivariateNormal, init_to_value
+from pyro.infer.autoguide import (
+    AutoContinuous,
+    AutoDiagonalNormal,
+    AutoMultivariateNormal,
+    init_to_value,
+)
 from torch import Tensor
 
 from pyro_dynogp.inference.density import Potential
@@ -75,12 +80,15 @@ def variational(
 
     With `independent` its covariance is diagonal (Pyro's AutoDiagonalNormal). Stops early when the
     ELBO, averaged over 50 steps, has not risen by 0.05 nats in 200 steps, and does not start where
-    Laplace's approximation has less than that to gain, as on long records. The parameters live in a
-    scope of the parameter store of their own.
+    Laplace's approximation has less than that to gain, as on long records.
     """
     potential = Potential(model, args, values)
     if independent:
-        return _independent(potential, run, schedule, key)
+        # Narrow at first: ridges are thin.
+        at = {name: value.detach() for name, value in values.items()}
+        guide = AutoDiagonalNormal(model, init_loc_fn=init_to_value(values=at), init_scale=0.003)
+        slower = replace(schedule, learning_rate=0.2 * schedule.learning_rate)
+        return _trained(potential, guide, run, slower, key)
 
     def laplace() -> dict[str, Tensor]:
         centre, root = potential.laplace(values)
@@ -96,25 +104,29 @@ def variational(
         return VariationalPosterior(Mixture.normal(potential, centre, root), elbo, AS_GOOD)
     start = {name: value.detach() for name, value in potential.unpack(centre).items()}
     guide = PreconditionedNormal(model, centre, root, init_loc_fn=init_to_value(values=start))
-    order = [site.name for site in potential.sites]
+    return _trained(potential, guide, run, schedule, key)
+
+
+def _trained(
+    potential: Potential, guide: AutoContinuous, run: Run, schedule: Schedule, key: str
+) -> VariationalPosterior:
+    """The normal that SVI makes of a guide, in a scope of the parameter store of its own."""
     loss = Trace_ELBO(
         num_particles=schedule.particles, vectorize_particles=True, max_plate_nesting=0
     )
     with pyro.get_param_store().scope(), pyro.validation_enabled(False):
         trained = train(
-            model,
-            guide,
-            args,
-            loss,
-            run,
-            schedule,
-            key=f"{key}-svi",
+            potential.model, guide, potential.args, loss, run, schedule, key=f"{key}-svi"
         )
-        names = list(guide._unconstrained_shapes)
+        names, order = list(guide._unconstrained_shapes), [site.name for site in potential.sites]
         if names != order:
             raise RuntimeError(f"The guide orders the sites {names}, the potential {order}.")
         posterior = guide.get_posterior()
-        fitted = Mixture.normal(potential, posterior.loc, posterior.scale_tril)
+        if isinstance(guide, AutoDiagonalNormal):
+            loc, root = posterior.base_dist.loc, torch.diag(posterior.base_dist.scale)
+        else:
+            loc, root = posterior.loc, posterior.scale_tril
+        fitted = Mixture.normal(potential, loc, root)
     return VariationalPosterior(fitted, trained.elbo, trained.message)
 
 
@@ -129,32 +141,3 @@ def log_weights(potential: Potential, centre: Tensor, root: Tensor, seed: int) -
     energies = potential.with_jacobian((centre + x @ root.mT).numpy())[0]
     log_q = -0.5 * (x.square() + math.log(2.0 * math.pi)).sum(1) - root.diagonal().log().sum()
     return -torch.tensor(energies) - log_q
-
-
-def _independent(
-    potential: Potential,
-    run: Run,
-    schedule: Schedule,
-    key: str,
-) -> VariationalPosterior:
-    """A normal with diagonal covariance, narrow at first: ridges are thin."""
-    values = {name: v.detach() for name, v in potential.at.items()}
-    guide = AutoDiagonalNormal(
-        potential.model, init_loc_fn=init_to_value(values=values), init_scale=0.003
-    )
-    loss = Trace_ELBO(
-        num_particles=schedule.particles, vectorize_particles=True, max_plate_nesting=0
-    )
-    with pyro.get_param_store().scope(), pyro.validation_enabled(False):
-        trained = train(
-            potential.model,
-            guide,
-            potential.args,
-            loss,
-            run,
-            replace(schedule, learning_rate=0.2 * schedule.learning_rate),
-            key=f"{key}-svi",
-        )
-        posterior = guide.get_posterior().base_dist
-        fitted = Mixture.normal(potential, posterior.loc, torch.diag(posterior.scale))
-    return VariationalPosterior(fitted, trained.elbo, trained.message)

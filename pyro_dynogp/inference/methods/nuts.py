@@ -22,7 +22,7 @@ from pyro_dynogp.inference.posteriors import Sampled
 from pyro_dynogp.inference.run import Run, at_least_one
 from pyro_dynogp.layers.sites import Program
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.prepared import Records, as_measured
+from pyro_dynogp.models.prepared import Records
 from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import child_seeds, parallel_map, seeded
 
@@ -99,16 +99,9 @@ class Nuts:
         for site, values in chain.effective_samples.items():
             diagnostics[f"effective samples {site}"] = float(values.min())
         draws = FrozenMapping({k: v.flatten(0, 1) for k, v in chain.draws.items()})
-        return Fitted(
-            model=problem.model,
-            posterior=Sampled(draws),
-            draws=draws,
-            mode=FrozenMapping(best.values),
-            history=best.history,
-            start_energies=np.array([optimum.energy for optimum in optima]),
-            diagnostics=FrozenMapping(diagnostics),
-            seed=run.seed,
-            records=as_measured(problem.records),
+        energies = [optimum.energy for optimum in optima]
+        return problem.fitted(
+            run, Sampled(draws), draws, best.values, best.history, energies, diagnostics
         )
 
 

@@ -22,10 +22,8 @@ from pyro_dynogp.inference.optimise.maximum import Optimizer, Optimum
 from pyro_dynogp.inference.posteriors import Mixture, draws_of_guide
 from pyro_dynogp.inference.run import Run, at_least_one
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.prepared import as_measured
 from pyro_dynogp.support.checkpoints import Piece
 from pyro_dynogp.support.errors import invalid
-from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import parallel_map, seeded
 
 Values = dict[str, Tensor]
@@ -135,16 +133,10 @@ class Normal:
             "elbo_sd": float(tail.std()),
             "optima": float(found.optima),
         }
-        return Fitted(
-            model=model,
-            posterior=found.guide,
-            draws=FrozenMapping({name: drawn[name] for name in found.mode}),
-            mode=FrozenMapping(found.mode),
-            history=found.elbo,
-            start_energies=np.array([optimum.energy for optimum in optima]),
-            diagnostics=FrozenMapping(diagnostics),
-            seed=run.seed,
-            records=as_measured(problem.records),
+        draws = {name: drawn[name] for name in found.mode}
+        energies = [optimum.energy for optimum in optima]
+        return problem.fitted(
+            run, found.guide, draws, found.mode, found.elbo, energies, diagnostics
         )
 
 

@@ -29,7 +29,7 @@ from pyro_dynogp.inference.posteriors import Sampled
 from pyro_dynogp.inference.run import Run, at_least_one
 from pyro_dynogp.layers.sites import Arguments, Program
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.prepared import PreparedRecord, as_measured
+from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.support.checkpoints import Piece
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
@@ -82,7 +82,7 @@ def _run(task: _Task) -> Piece:
                 task.schedule,
                 key=task.key,
                 rise=0.5,
-                layers={one.name: one.described for one in task.model.wires},
+                layers={place.name: place.described for place in task.model.wires},
             )
             with seeded(task.run.seed):
                 draws, log_q = _draw(guide, args, method.draws, vectorised=not own)
@@ -122,7 +122,7 @@ def _draw(
         return own, {name: site["log_prob"] for name, site in sites.items()}
 
     def stack(traces: Sequence[Values]) -> Values:
-        return {name: torch.stack([one[name] for one in traces]) for name in traces[0]}
+        return {name: torch.stack([trace[name] for trace in traces]) for name in traces[0]}
 
     with torch.no_grad():
         if vectorised:
@@ -130,7 +130,7 @@ def _draw(
                 draws, log_q = latent(pyro.poutine.trace(guide).get_trace(*args))
             return draws, {k: v.expand(count) for k, v in log_q.items()}
         traces = [latent(pyro.poutine.trace(guide).get_trace(*args)) for _ in range(count)]
-    log_q = stack([{k: v.sum() for k, v in one.items()} for _, one in traces])
+    log_q = stack([{k: v.sum() for k, v in densities.items()} for _, densities in traces])
     return stack([own for own, _ in traces]), log_q
 
 
@@ -212,16 +212,14 @@ class Trajectories:
         log_q = {k[len("log_q/") :]: v for k, v in best.items() if k.startswith("log_q/")}
         others = {k: v for k, v in sampled.items() if k not in kept}
         draws = FrozenMapping(kept)
-        return Fitted(
-            model=problem.model,
-            posterior=Sampled(draws, "svi", FrozenMapping(others), FrozenMapping(log_q)),
-            draws=draws,
-            mode=FrozenMapping({k: v.median(0).values for k, v in kept.items()}),
-            history=elbo,
-            start_energies=-np.array(levels)[order],
-            diagnostics=FrozenMapping({"elbo": float(tail.mean()), "elbo_sd": float(tail.std())}),
-            seed=run.seed,
-            records=as_measured(problem.records),
+        return problem.fitted(
+            run,
+            Sampled(draws, "svi", FrozenMapping(others), FrozenMapping(log_q)),
+            draws,
+            {k: v.median(0).values for k, v in kept.items()},
+            elbo,
+            -np.array(levels)[order],
+            {"elbo": float(tail.mean()), "elbo_sd": float(tail.std())},
         )
 
     def _trained(self, problem: Problem, run: Run) -> list[Piece]:

@@ -64,12 +64,12 @@ def layer_guide(model: Model, choice: Any, values: Mapping[str, Tensor], n: int)
             "Pyro function",
             got=repr(choice),
         )
-    statics = {one.name for one in model.wires if not isinstance(one.layer, Dynamic)}
+    statics = {place.name for place in model.wires if not isinstance(place.layer, Dynamic)}
 
     def family(name: str, prior: Any) -> Family:
         base, _, number = name.rpartition("_")
         layer = base if number.isdigit() else name
-        if any(layer == one.name for one in model.wires if isinstance(one.layer, Dynamic)):
+        if any(layer == place.name for place in model.wires if isinstance(place.layer, Dynamic)):
             return kinds[kind]
         if layer in statics or (name.endswith("_residual") and base in statics):
             return SameAsPrior()
@@ -92,11 +92,11 @@ def starting_trajectories(
             system = model.begin(system, model.states_of(values, suffix))
             outputs = output_process(system, record)
             found = outputs.smooth(record.observations)
-        for one in model.wires:
-            integrated = one.last and model.integrate == "last"
-            if isinstance(one.layer, Dynamic) and not integrated:
-                path = torch.tensor(found[one.name].mean[0])
-                out[one.name + suffix] = path if one.layer.outputs > 1 else path[:, 0]
+        for place in model.wires:
+            integrated = place.last and model.integrate == "last"
+            if isinstance(place.layer, Dynamic) and not integrated:
+                path = torch.tensor(found[place.name].mean[0])
+                out[place.name + suffix] = path if place.layer.outputs > 1 else path[:, 0]
     return out
 
 
