@@ -9,6 +9,7 @@ import pyro_dynogp as dgp
 from pyro_dynogp.data.channels import Step
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.scaling import Scaling
+from pyro_dynogp.lti.grid import TimeGrid
 from pyro_dynogp.models import prepared
 from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.models.structure import Structure
@@ -45,7 +46,7 @@ def counts(monkeypatch):
 
     counted(Structure, "check", "checked")
     counted(prepared, "_scaled", "scaled")
-    counted(prepared, "time_grid", "grid")
+    counted(TimeGrid, "__init__", "grid")
     counted(Record, "tensors", "tensors")
     counted(Scaling, "from_records", "learnt")
     return found
