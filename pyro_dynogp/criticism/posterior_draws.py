@@ -16,6 +16,7 @@ from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.finding import apart
 from pyro_dynogp.criticism.kept_draws import kept
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.inference.cascade_coordinates import StraightPotential
 from pyro_dynogp.inference.density import Potential, log_prob_by_draw
 from pyro_dynogp.inference.methods import annealed as annealing
 from pyro_dynogp.inference.posteriors import Draws, Mixture
@@ -87,8 +88,9 @@ def draws_of(
     NUTS: its draws. A variational posterior: fresh draws of it; of a cascade by default those of
     inducing values and first states, with all else at an optimum, whose own uncertainty then
     counts nowhere. A posterior mode: Laplace's approximation around it. Where Pareto's k says that
-    a normal does not describe the posterior of a linear model, particles are annealed from it to
-    the posterior itself (`inference.annealing`).
+    a normal does not describe the posterior of a linear model, another one is taken that is normal
+    in coordinates without bent ridges (`inference.cascade_coordinates`); where that does not
+    either, particles are annealed from it to the posterior itself (`inference.methods.annealed`).
 
     Args:
         fit: the fit. count: number of draws S (of NUTS all there are). seed: for them.
@@ -167,19 +169,29 @@ def _annealed(
             advice="Fit with method='svi' (the default of cascades) or 'nuts', or use "
             "parameters='mode'.",
         )
-    normal = normal_of(fit)
-    z, start = annealing.around(normal, count, seed)
-    target = annealing.Joint(fit.model.collapsed, (_argument(fit.records),), normal.sites)
     with seeded(seed):
-        annealed = annealing.anneal(z, start, target, seed=seed, progress=progress)
-        values = FrozenMapping(normal.at_latent(annealed.z))
+        argument = (_argument(fit.records),)
+        potential = StraightPotential(fit.model.collapsed, argument, fit.mode)
+        loc, root = map(torch.as_tensor, potential.laplace(fit.mode, widest=WIDEST))
+        z, start = annealing.around(loc, root, count, seed)
+        target = annealing.Joint(potential, _samples(fit.records))
+        ratio = (target(z)[0] - start(z)[0]).numpy()
+        straight = float(arviz_bridge.psis(ratio)[1]) <= arviz_bridge.good_k(count)
+        found = None
+        if not straight:
+            found = annealing.anneal(z, start, target, seed=seed, progress=progress)
+            z = found.z
+        with torch.no_grad():
+            values = FrozenMapping(potential.unpack(z))
+    log_p = log_joint(fit, values)
+    way = "annealed" if found else "a Student-t in straight coordinates"
     return PosteriorDraws(
         values,
-        log_joint(fit, values),
-        None,
+        log_p,
+        None if found else log_p - ratio,
         np.zeros(count, dtype=int),
-        f"annealed from {own.kind}, whose own Pareto k is {shape}",
-        annealed.ancestor,
+        f"{way} from {own.kind}, whose own Pareto k is {shape}",
+        found.ancestor if found else None,
     )
 
 
