@@ -195,6 +195,39 @@ def _annealed(
     )
 
 
+def carried(
+    old: Fitted, draws: PosteriorDraws, new: Fitted, *, seed: int, progress: bool = False
+) -> PosteriorDraws:
+    """Draws of a posterior moved to that given other data, without a fit (Chopin 2002).
+
+    Particles are annealed from the one to the other; draws of another density are resampled by
+    their ratios first.
+
+    Args:
+        old: a fit without static functions. draws: of its posterior.
+        new: the same with other records. seed: of the moves. progress: whether to show a bar.
+    """
+    before = StraightPotential(old.model.collapsed, (_argument(old.records),), old.mode)
+    after = before.on((_argument(new.records),))
+    start, target = (
+        annealing.Joint(potential, _samples(fit.records))
+        for potential, fit in ((before, old), (after, new))
+    )
+    count = len(draws)
+    generator = np.random.default_rng(seed)
+    weight = np.exp(arviz_bridge.psis(draws.log_ratio)[0])
+    first = np.searchsorted(np.cumsum(weight), (np.arange(count) + generator.random()) / count)
+    first = np.minimum(first, count - 1)
+    z = before.pack(draws.values)[first]
+    found = annealing.anneal(z, start, target, seed=seed, progress=progress)
+    with torch.no_grad():
+        values = FrozenMapping(after.unpack(found.z))
+    roots = np.arange(count) if draws.ancestor is None else draws.ancestor
+    kind = "annealed from draws given other data"
+    group = np.zeros(count, dtype=int)
+    return PosteriorDraws(values, None, None, group, kind, roots[first[found.ancestor]])
+
+
 def log_joint(fit: Fitted, values: Values) -> np.ndarray:
     """Log p(y, values) (S,) of draws, y the training records; -inf where it has no value."""
     return log_joint_of(

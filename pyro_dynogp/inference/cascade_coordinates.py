@@ -22,6 +22,7 @@ about zero, prior and likelihood are the same, so that nothing is lost but a mir
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from typing import Any
 
 import torch
@@ -35,7 +36,7 @@ from pyro_dynogp.inference.cascade_coordinate_steps import (
     Step,
     affine,
 )
-from pyro_dynogp.inference.density import Potential, Site, parts
+from pyro_dynogp.inference.density import Potential, Site, parts, within_edges
 from pyro_dynogp.layers.functions import StaticFunction
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.wiring import Dynamic, Static, Wire
@@ -53,13 +54,22 @@ class StraightPotential(Potential):
         super().__init__(model, args, values)
         self.steps = steps_of(model, Potential(model, args, values))
 
+    def on(self, args: tuple[Any, ...]) -> StraightPotential:
+        """The density of other data in the same coordinates."""
+        other = copy(self)
+        Potential.__init__(other, self.model, args, self.at)
+        return other
+
     def pack(self, values: Mapping[str, Tensor]) -> Tensor:
-        """Constrained values of every site to coordinates (d,)."""
-        z = by_name(self.sites, super().pack(values))
+        """Constrained values (*s, *shape) of every site to coordinates (*s, d)."""
+        first = self.sites[0]
+        lead = values[first.name].shape[: values[first.name].dim() - len(first.shape)]
+        inverse = [site.transform.inv(values[site.name]).reshape(*lead, -1) for site in self.sites]
+        z = by_name(self.sites, within_edges(torch.cat(inverse, -1)))
         with torch.no_grad():
             for step in reversed(self.steps):
                 step.backward(z)
-        return torch.cat([z[site.name].reshape(-1) for site in self.sites])
+        return torch.cat([z[site.name].reshape(*lead, -1) for site in self.sites], -1)
 
     def unpack(self, x: Tensor) -> dict[str, Tensor]:
         """Coordinates (*s, d) to constrained values (*s, *shape) of every site."""

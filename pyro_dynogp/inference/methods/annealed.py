@@ -126,7 +126,7 @@ def anneal(
     generator = torch.Generator().manual_seed(seed)
     count = len(z)
     chains = -(-count // CHAINS)
-    now = _evaluate(z, start, target, torch.arange(count))
+    now = _evaluate(z, start, target, 0.0, torch.arange(count))
     b, log_evidence, size = 0.0, 0.0, 0.5
     temperatures: list[float] = []
     accepted: list[float] = []
@@ -137,7 +137,7 @@ def anneal(
                 f"annealing: after {MOST_TEMPERATURES} steps the temperature is {b:.3g} of 1. The "
                 "posterior is too far from where the particles start: use method='nuts'."
             )
-        gain = now.target - now.start
+        gain = (now.target - now.start).nan_to_num(-torch.inf, torch.inf, -torch.inf)
         if not bool(torch.isfinite(gain).any()):
             raise RuntimeError("annealing: no particle has a density under the target.")
         step = _step(gain, 1.0 - b)
@@ -201,9 +201,10 @@ class _Particles:
         return value, b * self.target_gradient + (1.0 - b) * self.start_gradient
 
 
-def _evaluate(z: Tensor, start: Density, target: Density, ancestor: Tensor) -> _Particles:
-    first, first_gradient = start(z)
+def _evaluate(z: Tensor, start: Density, target: Density, b: float, ancestor: Tensor) -> _Particles:
     last, last_gradient = target(z)
+    # At the end the start counts no more, and may cost as much as the target.
+    first, first_gradient = start(z) if b < 1.0 else (last, last_gradient)
     return _Particles(z, first, last, first_gradient, last_gradient, ancestor)
 
 
@@ -263,7 +264,7 @@ def _move(
     there = now
     for leap in range(leaps):
         momentum = momentum + (0.5 if leap == 0 else 1.0) * h * (gradient @ root)
-        there = _evaluate(there.z + (h * momentum) @ root.mT, start, target, now.ancestor)
+        there = _evaluate(there.z + (h * momentum) @ root.mT, start, target, b, now.ancestor)
         value, gradient = there.at(b)
     momentum = momentum + 0.5 * h * (gradient @ root)
     change = value - 0.5 * momentum.square().sum(-1) - energy
