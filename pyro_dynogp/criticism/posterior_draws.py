@@ -16,7 +16,8 @@ from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.finding import apart
 from pyro_dynogp.criticism.kept_draws import kept
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.inference.density import Potential, log_prob_by_draw
+from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.log_joint import density_of, log_prob_by_draw
 from pyro_dynogp.inference.methods import annealed as annealing
 from pyro_dynogp.inference.posteriors import Draws, Mixture
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
@@ -169,7 +170,8 @@ def _annealed(
         )
     normal = normal_of(fit)
     z, start = annealing.around(normal, count, seed)
-    target = annealing.Joint(fit.model.collapsed, (_argument(fit.records),), normal.sites)
+    log_density = density_of(fit.model.collapsed, (fit.records,))
+    target = annealing.Joint(log_density, normal.sites)
     with seeded(seed):
         annealed = annealing.anneal(z, start, target, seed=seed, progress=progress)
         values = FrozenMapping(normal.at_latent(annealed.z))

@@ -20,7 +20,7 @@ from pyro_dynogp.layers.sites import Site, Values, sample
 from pyro_dynogp.layers.static import StaticPrior
 from pyro_dynogp.models.checks import check_direct, check_records, prepare
 from pyro_dynogp.models.explicit import observe_explicit
-from pyro_dynogp.models.limits import at_limits, count_as_probabilities, scaled_limits
+from pyro_dynogp.models.limits import at_limits, log_probability_scale, scaled_limits
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.priors import (
     FLAT,
@@ -347,7 +347,9 @@ class Model:
             else:
                 last = self.integrate == "last"
                 observe_explicit(outputs, record, suffix, last_integrated=last)
-            count_as_probabilities(at_limits(self.layers, record), outputs, suffix)
+            at = at_limits(self.layers, record)
+            if at.any():
+                pyro.factor(f"at_limits{suffix}", log_probability_scale(at, outputs))
 
     def sample_states(self, suffix: str) -> dict[str, Tensor]:
         """Sample what past inputs left at the first sample of a record, by layer."""

@@ -136,7 +136,7 @@ def test_posterior_of_a_conjugate_model():
     loc = tensor([math.log(1.2), 0.8])
     guide = Mixture.normal(potential, loc, 0.6 * torch.eye(2, dtype=torch.float64))
     z, start = around(guide, 1500, 0)
-    found = anneal(z, start, Joint(model, (), potential.sites))
+    found = anneal(z, start, Joint(potential.log_density, potential.sites))
     values = potential.unpack(found.z)
     n, lam = 5, 0.5
     mean = n * y.mean() / (n + lam)
@@ -158,7 +158,7 @@ def test_one_bad_particle_does_not_spoil_the_others(record):
         trace = pyro.poutine.trace(model).get_trace(record)
     values = {n: s["value"] for n, s in trace.nodes.items() if s["type"] == "sample" and n != "y"}
     potential = Potential(model, (record,), values)
-    joint = Joint(model, (record,), potential.sites)
+    joint = Joint(potential.log_density, potential.sites)
     z = potential.pack(values)
     batch = torch.stack([z, z + 0.01, torch.full_like(z, 1e3), z.clone()])
     batch[3, 0] = torch.nan

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from pyro_dynogp.inference.density import Site, each_with_gradient, joint_energy
+from pyro_dynogp.inference.log_joint import LogJoint
 from pyro_dynogp.inference.posteriors import Mixture
 
 # Effective share of particles after a step; Hamiltonian moves at each temperature, and at the end.
@@ -49,11 +50,10 @@ class Joint:
     """Log p(y, values) of a Pyro model with the Jacobian of the unconstrained vector.
 
     Attributes:
-        model, args: the model and what it is called with. sites: of the vector.
+        log_joint: of constrained values. sites: of the vector.
     """
 
-    model: Any
-    args: tuple[Any, ...]
+    log_joint: LogJoint
     sites: Sequence[Site]
 
     def __call__(self, z: Tensor) -> tuple[Tensor, Tensor]:
@@ -63,7 +63,7 @@ class Joint:
         return -energy.masked_fill(far, torch.inf), -slope.masked_fill(far[:, None], 0.0)
 
     def _energy(self, z: Tensor) -> Tensor:
-        return joint_energy(self.model, self.args, self.sites, z, jacobian=True)
+        return joint_energy(self.log_joint, self.sites, z, jacobian=True)
 
 
 @dataclass(frozen=True, eq=False)
