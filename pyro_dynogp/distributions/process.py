@@ -134,7 +134,7 @@ class LTIProcess(Trajectory):
         )
 
     @property
-    def noise(self) -> Tensor:
+    def noise(self) -> Tensor:  # type: ignore[override]
         """The jitter, as a variance (*b, n_y) [output^2]."""
         v = jitter_variance(self.modes, self.initial_covariance, self.jitter)
         return v.expand((*v.shape[:-1], self.modes.outputs))

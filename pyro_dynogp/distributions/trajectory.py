@@ -123,10 +123,7 @@ class Trajectory(TorchDistribution):
         if self._validate_args:
             self._validate_sample(value)
         residual, missing = split_missing(self.rows(value - self.mean))
-        if missing is None:
-            K = self.root
-        else:
-            K = self.covariance(self.noise, missing)
+        K = self.root if missing is None else self.covariance(self.noise, missing)
         batch = batch_dims(K)
         lead = residual.shape[: residual.dim() - 1 - batch]
         log_prob = K.log_prob(columns(residual, batch))  # *b, R
