@@ -18,16 +18,16 @@ from numba import njit
 
 from pyro_dynogp.lti.innovation_rows import set_propagators
 from pyro_dynogp.lti.lanes import choose, get, put, splat
-from pyro_dynogp.support.compiled import BORROWING
+from pyro_dynogp.support.compiled import BORROWING, WITHIN
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def add(array, k, x):
     """Add x to vector k of an array of lanes."""
     put(array, k, get(array, k) + x)
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def gain_adjoint(x, w, state, bar):
     """Write 2 (A_bar u + M_bar conj u) to bar, u = the vector of x that begins at w."""
     pairs = bar.shape[0]
@@ -65,7 +65,7 @@ def gain_adjoint(x, w, state, bar):
         put(bar, a + 1, ti)
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def observe_adjoint(x, at, i, o, c, work, bars, injecting, settled):
     """Reverse of a row's sample but for A and M: e_bar is in bars.w, those of r and v in work."""
     size = bars.w.shape[0]
@@ -137,7 +137,7 @@ def observe_adjoint(x, at, i, o, c, work, bars, injecting, settled):
             add(bars.q, size * o + a + 1, ei)
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def _read_adjoint(bar, value, s, c, k, c_bar):
     """Bars of entries of A and M after s_a = A_ab conj(c_b) + M_ab c_b; k is the place of c_b."""
     cr = get(c, k)
@@ -151,7 +151,7 @@ def _read_adjoint(bar, value, s, c, k, c_bar):
     return bar[0] + (rr - ii), bar[1] + (ir + ri), bar[2] + (rr + ii), bar[3] + (ir - ri)
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def covariance_adjoint(x, at, o, phi, f, c, bars):
     """Reverse of e and of the step for A and M; what phi multiplies is added to bars.log_phi."""
     size = bars.w.shape[0]
@@ -234,7 +234,7 @@ def covariance_adjoint(x, at, o, phi, f, c, bars):
         add(bars.log_phi, a + 1, li)
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def mean_adjoint(x, at, phi, length, bars):
     """Reverse of the step for F; then the gradient by the poles."""
     size = bars.w.shape[0]

@@ -28,19 +28,22 @@ SETTLED = 1e-14
 def load_segment(rows, first, last, point, lane, work):
     """Residuals and noise of one point's rows; whether none is missing."""
     n_y = rows.noise.shape[2]
-    constant = rows.noise.shape[1] == 1
     b = min(point, rows.residual.shape[0] - 1)
+    for i in range((last - first) * n_y):
+        work.r[i, lane] = rows.residual[b, first * n_y + i]
+    varying = rows.noise.shape[1] > 1
+    for i in range((last - first) * n_y):
+        work.v[i, lane] = rows.noise[point, (first + i // n_y) * varying, i % n_y]
     several = rows.missing.shape[0]
+    if several == 0:
+        return True
+    b = min(point, several - 1)
     whole = True
-    for k in range(first, last):
-        for o in range(n_y):
-            i = (k - first) * n_y + o
-            work.r[i, lane] = rows.residual[b, k * n_y + o]
-            work.v[i, lane] = rows.noise[point, 0 if constant else k, o]
-            if several > 0 and rows.missing[min(point, several - 1), k * n_y + o]:
-                work.v[i, lane] = np.inf
-                work.r[i, lane] = 0.0
-                whole = False
+    for i in range((last - first) * n_y):
+        if rows.missing[b, first * n_y + i]:
+            work.v[i, lane] = np.inf
+            work.r[i, lane] = 0.0
+            whole = False
     return whole
 
 

@@ -24,10 +24,10 @@ from __future__ import annotations
 from numba import njit
 
 from pyro_dynogp.lti.lanes import choose, complex_exponential, get, put, root, splat
-from pyro_dynogp.support.compiled import BORROWING
+from pyro_dynogp.support.compiled import BORROWING, WITHIN
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def set_propagators(phi, poles, length):
     """Write exp(lambda length) behind the propagators of no step."""
     P = poles.shape[0] // 2
@@ -38,7 +38,7 @@ def set_propagators(phi, poles, length):
         put(phi, 2 * P + 2 * a + 1, im)
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def move_mean(x, src, dst, phi, f):
     """F of the next row's record at dst from the record at src; phi begins at f."""
     P = phi.shape[0] // 4
@@ -54,7 +54,7 @@ def move_mean(x, src, dst, phi, f):
         put(x, dst + mean + a + 1, pr * im + pi * re)
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def move_covariance(x, src, dst, phi, f, q, c, o, e):
     """A and M of the next row's record at dst from the record at src; e of its output o."""
     P = phi.shape[0] // 4
@@ -125,7 +125,7 @@ def move_covariance(x, src, dst, phi, f, q, c, o, e):
         put(e, a + 1, eai)
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def read(c, o, x, at, P):
     """2 Re c_o' x of the complex vector that begins at `at`."""
     total = splat(0.0)
@@ -138,7 +138,7 @@ def read(c, o, x, at, P):
     return total + total
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def observe(x, at, c, o, r, d, work, settled):
     """Write the gain and zeta of the record at `at`; d given, or the gain kept where it rests."""
     P = work.e.shape[0] // 2
