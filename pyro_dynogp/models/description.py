@@ -33,26 +33,32 @@ class Part:
 
 def describe(model: Model) -> tuple[Part, ...]:
     """Each part of a model, inputs first, measured output last."""
-    channels = [(in_words(one), one) for one in model.channels]
-    driving = [part for part, one in channels if not one.direct]
-    direct = [replace(part, heading=f"plus {part.heading}") for part, one in channels if one.direct]
+    channels = [(in_words(channel), channel) for channel in model.channels]
+    driving = [part for part, channel in channels if not channel.direct]
+    direct = [
+        replace(part, heading=f"plus {part.heading}")
+        for part, channel in channels
+        if channel.direct
+    ]
     count = model.inputs - model.direct
     inputs = Part("inputs", f"{count} input{'s' if count != 1 else ''}")
-    layers = [_layer(layer) for layer in model.layers]
-    plain = model.direct - sum(len(one.names) for one in model.channels if one.direct)
+    back = {name for wire in model.wires for name in wire.feedback}
+    layers = [_layer(wire.layer, fed_back=wire.name in back) for wire in model.wires]
+    plain = model.direct - sum(len(channel.names) for channel in model.channels if channel.direct)
     if plain:
         direct.append(Part("direct inputs", f"plus {plain} direct inputs", joins=True))
     return (inputs, *driving, *layers, *direct, _noise(model.likelihood))
 
 
-def _layer(layer: Dynamic | Static) -> Part:
+def _layer(layer: Dynamic | Static, *, fed_back: bool) -> Part:
     if isinstance(layer, Dynamic):
         noise = "process noise" if layer.process_noise else "no process noise"
         pairs = f"{layer.pairs} pair{'s' if layer.pairs != 1 else ''} of poles"
         return Part("dynamics", "linear dynamics", f"{pairs}, {noise}")
     limits = [f"{at:.4g}" for at in layer.limits or () if at is not None]
     stops = f", stops at {' and '.join(limits)}" if limits else ""
-    return Part("function", "static function", f"{layer.inducing} inducing values{stops}")
+    heading = "static function in feedback" if fed_back else "static function"
+    return Part("function", heading, f"{layer.inducing} inducing values{stops}")
 
 
 def _noise(likelihood: Likelihood) -> Part:

@@ -61,9 +61,10 @@ def draw_outputs(
     mean = signals[wire.name]
     variance = torch.zeros_like(mean)
     if isinstance(layer, StaticSystem) and not wire.pathwise:
+        assert isinstance(wire.layer, Static)
         seen = see(signals, wire)
         _, mean, variance = draw_static(
-            wire.layer, layer, seen, random.residual[wire.name], switches
+            wire.layer.support, layer, seen, random.residual[wire.name], switches
         )
     level = system.level(inputs)
     return Drawn(signals, mean if level is None else mean + level, variance.expand(mean.shape))

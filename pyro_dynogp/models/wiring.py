@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
+
+from gpytorch.kernels import Kernel
 
 from pyro_dynogp.lti.modes import NoiseStructure
 from pyro_dynogp.support.errors import invalid
@@ -64,7 +66,7 @@ class Static:
 
     outputs: int = 1
     inducing: int = 32
-    kernel: Any = None
+    kernel: Kernel | None = None
     mean: Literal["constant", "linear"] | None = None
     limits: Limits | None = None
     skip: tuple[str, ...] = ()
@@ -169,7 +171,8 @@ def wire(inputs: int, layers: Sequence[Layer], output: str | None = None) -> tup
             linear = place == 0 or looped or layer.limits is not None
             layer = replace(layer, mean=layer.mean or ("linear" if linear else "constant"))
             if layer.limits is not None:
-                _check_limits(name, layer, channels, name == output and name not in back)
+                end = name == output == names[-1] and name not in back
+                _check_limits(name, layer, channels, end)
         elif channels == 0 and not (layer.process_noise or layer.feedback):
             raise invalid(
                 f"process_noise of layer {name!r}",
@@ -274,7 +277,7 @@ def _check_layer(name: str, layer: Layer) -> None:
 
 def _check_limits(name: str, layer: Static, channels: int, last: bool) -> None:
     assert layer.limits is not None
-    known = [one for one in layer.limits if one is not None]
+    known = [limit for limit in layer.limits if limit is not None]
     if len(layer.limits) != 2 or not known or known != sorted(set(known)):
         raise invalid(
             f"limits of layer {name!r}",

@@ -17,7 +17,8 @@ def line_case(outputs, inputs, irregular, **options):
     record = make_record(inputs, outputs, irregular=irregular)
     model = model.scaled_to(record)
     system = system_at(model, values_of(model, record, seed=outputs + 2 * irregular))
-    return record, ClosedLoop(model, system, record), output_process(system, model.scaling, record)
+    (prepared,) = model.prepare(record)
+    return record, ClosedLoop(model, system, record), output_process(system, prepared)
 
 
 @pytest.mark.parametrize(("outputs", "inputs", "irregular"), CASES)
@@ -60,7 +61,7 @@ def test_process_noise_of_free_runs_is_that_of_the_linear_system(outputs, irregu
 
 
 def test_runs_with_drawn_functions_are_those_of_a_plain_simulation():
-    """Functions from their dense conditional, states step by step in numpy; KS at ten times in all."""
+    """Functions from their dense conditional, states step by step in numpy; KS at ten times."""
     count = 300
     model = spring()
     record = make_record(irregular=True, missing=False)
@@ -94,7 +95,7 @@ def test_runs_with_drawn_functions_are_those_of_a_plain_simulation():
     expected = loop.simulate(functions, rng)[..., 0]
     with torch.random.fork_rng():
         torch.manual_seed(1)
-        process = output_process(system, model.scaling, record)
+        process = output_process(system, model.prepare(record)[0])
         found = loop.scaled(process.sample((count,)).numpy()[..., None])[..., 0]
     assert expected[:, 30].std() > 2.0 * float(loop.noise[0]) ** 0.5
     for time in (5, 12, 20, 30, 39):
@@ -102,9 +103,7 @@ def test_runs_with_drawn_functions_are_those_of_a_plain_simulation():
     runs = process.components(samples=count, seed=2)
     y = runs.mean + np.sqrt(runs.noise_variance) * rng.standard_normal(runs.mean.shape)
     for time in (5, 12, 20, 30, 39):
-        assert ks_2samp(loop.scaled(y)[:, time, 0], expected[:, time]).pvalue > 0.001, (
-            time
-        )  # ten comparisons
+        assert ks_2samp(loop.scaled(y)[:, time, 0], expected[:, time]).pvalue > 0.001, time
 
 
 @pytest.mark.parametrize("outputs", [1, 2])

@@ -93,7 +93,7 @@ def test_runs_that_diverge_are_reported_where_they_do(fitted):
     mode = fit.at_mode()
     gain = mode.mode["g_input_gain"].clone()
     gain[:, 1] *= -20.0  # what pulled back drives away
-    wild = mode.with_draws({k: v for k, v in mode.draws.items()} | {"g_input_gain": gain[None]})
+    wild = mode.with_draws(dict(mode.draws) | {"g_input_gain": gain[None]})
     with pytest.warns(UserWarning, match=r"simulation: .* first at sample \d+ "):
         wild.simulate(record)
     with warnings.catch_warnings():
@@ -110,7 +110,7 @@ def test_several_records_and_another_step():
     options = {"workers": 1, "progress": False, "restarts": 1, "steps": 20, "method": "map"}
     fit = dgp.fit(dgp.NonlinearFeedback(1), records, **options)
     assert {"g_initial_state_0", "g_initial_state_1"} <= set(fit.mode)
-    error = free_run_error(fit.model.collapsed, fit.mode, fit.records)
+    error = free_run_error(fit.model.collapsed, fit.mode, fit.model.prepare(fit.records))
     assert 0.0 < error < 1.0
     assert np.isfinite(fit.forecast(records[0], records[1]).mean).all()
 
