@@ -82,8 +82,8 @@ def has_process_noise(model: Model) -> bool:
 def with_output_function(model: Model, limits: Limits | None = None) -> Model | None:
     """The model with a static layer after its last dynamic one.
 
-    None where there is one already, or feedback. Its prior mean is a straight line, to which it goes back beyond the data; or one that stops at
-    limits [output].
+    None where there is one already, or feedback. Its prior mean is a straight line, to which it
+    goes back beyond the data; or one that stops at limits [output].
     """
     if isinstance(model.layers[-1], Static) or model.has_feedback:
         return None

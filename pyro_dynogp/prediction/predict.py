@@ -90,7 +90,7 @@ def warn_of_divergence(fit: Fitted, record: Record, runs: np.ndarray, kind: str)
     if left.any():
         first = int(left.any(0).argmax())
         warnings.warn(
-            f"{kind}: {left.any(1).mean():.0%} of the free runs leave the range of the training "
+            f"{kind}: {left.any(1).sum()} of {len(runs)} free runs leave the range of the training "
             f"outputs by more than {FAR:g} times its width, first at sample {first} (time "
             f"{record.time[first]:.6g}). What follows is no prediction.",
             stacklevel=5,
