@@ -12,7 +12,7 @@ from scipy.signal import cont2discrete, lfilter
 import pyro_dynogp as dgp
 from pyro_dynogp.data.signals import delayed, play
 from pyro_dynogp.effects.calendar import _contrasts, calendar
-from pyro_dynogp.effects.clock_shift import _preferred
+from pyro_dynogp.effects.clock_shift import _preferred, clock_shift
 from pyro_dynogp.effects.clock_shift_score import shifts_of
 from pyro_dynogp.effects.dead_time import dead_time
 from pyro_dynogp.effects.dead_zone import dead_zone
@@ -28,8 +28,8 @@ from pyro_dynogp.statistics.prewhitening import Projection, Variants, prewhitene
 from pyro_dynogp.statistics.regression import regress
 from pyro_dynogp.statistics.serial import held_out_innovations
 from tests.discrepancy.made import FEW, coloured, lag, residuals_of
-from tests.discrepancy.series import residuals
-from tests.effects.scenes import first_extra, stamps, step_inputs, two_paths
+from tests.discrepancy.series import residuals, share
+from tests.effects.scenes import MELBOURNE, first_extra, stamps, step_inputs, two_paths
 
 PACKAGE = Path(dgp.__file__).parent
 
@@ -171,6 +171,15 @@ def test_a_rule_has_no_instant_to_choose_and_summers_come_first():
     assert _preferred(gains, 2, rules, 1, 3.0) == 0
     assert _preferred(gains, 2, rules, 1, 2.0) == 1
     assert _preferred(gains, 2, rules, 1, 1.0) == 2
+
+    def late_from_90(t, mean, u):
+        share_ = share(u[:, 0], 1.0)
+        return np.where(t >= 90.0, np.interp(t + 1.0, t, share_) - share_, 0.0)
+
+    r = residuals(3, 1200, step=0.5, effect=late_from_90)
+    r = dataclasses.replace(r, stamps=stamps(1200, "30min"))
+    assert "rule" not in clock_shift(r, FEW, zones=(MELBOURNE,)).where
+    assert "rule" in clock_shift(r, other(preference=1e6), zones=(MELBOURNE,)).where
 
 
 def test_ties_and_flat_ends_are_limits():
