@@ -133,7 +133,7 @@ class LTIProcess(Trajectory):
         return SemiseparableCovariance(self.modes, self.grid, noise_variance, P0, missing)
 
     @property
-    def noise(self) -> Tensor:  # type: ignore[override]
+    def noise(self) -> Tensor:  # type: ignore[override]  # others set it, here it follows from modes
         """The jitter, as a variance (*b, n_y) [output^2]."""
         v = jitter_variance(self.modes, self.initial_covariance, self.jitter)
         return v.expand((*v.shape[:-1], self.modes.outputs))
@@ -254,13 +254,12 @@ class ConditionedLTIProcess(Trajectory):
                 advice="Condition with a small measurement noise instead.",
             )  # fmt: skip
         self.y = value
-        residual, missing = split_missing(self.observed.rows(value - observed.mean))
-        self.residual = residual
+        self.residual, missing = split_missing(self.observed.rows(value - observed.mean))
         v = observed.noise_rows
         self.noise = v if missing is None else v.masked_fill(missing, torch.inf)
         self.K = self.prior.covariance(observed.noise, missing)
         self._with_jitter: SemiseparableCovariance | None = None
-        self._shape(residual.shape[:-1], len(self.prior.grid), validate_args)
+        self._shape(self.residual.shape[:-1], len(self.prior.grid), validate_args)
 
     def covariance(
         self, noise_variance: Tensor, missing: Tensor | None = None
@@ -294,8 +293,7 @@ class ConditionedLTIProcess(Trajectory):
         h = self.prior.from_innovations(noise)
         e = torch.randn(shape, dtype=torch.float64, device=h.device)
         v = self.observed.noise_variance
-        departure = self.rows(self.y - h - v.sqrt() * e)
-        departure = departure.masked_fill(self.K.missing, 0.0)
+        departure = self.rows(self.y - h - v.sqrt() * e).masked_fill(self.K.missing, 0.0)
         K = self._jittered
         alpha = apply(K.solve, K, departure)
         update = apply(K.signal_matmul, K, alpha) + self.prior.noise_rows * alpha

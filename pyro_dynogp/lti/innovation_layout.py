@@ -123,9 +123,9 @@ class Bars(NamedTuple):
     d: np.ndarray
 
 
-def bars_of(P: int, n_y: int, several: bool) -> Bars:
+def bars_of(P: int, n_y: int) -> Bars:
     """Zeros for one group."""
     outputs, covariances, rows = 2 * P * n_y, 2 * P * (P + 1), SEGMENT * n_y
     sizes = (2 * P, outputs, outputs, covariances + 2 * P, outputs + n_y, 1, covariances)
     arrays = [np.zeros((size, WIDTH)) for size in (*sizes, 2 * P, 2 * P, rows, rows)]
-    return Bars(*arrays) if several else Bars(*arrays)._replace(c=None)
+    return Bars(*arrays) if n_y > 1 else Bars(*arrays)._replace(c=None)

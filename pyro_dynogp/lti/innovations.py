@@ -41,19 +41,29 @@ def _from_lanes(bars: list[np.ndarray], like: Tensor) -> Tensor:
     return out.reshape(like.shape)
 
 
+def _times(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Product of complex arrays, rounded alike in every place, as numpy's own need not be."""
+    re = a.real * b.real - a.imag * b.imag
+    return re + 1j * (a.real * b.imag + a.imag * b.real)
+
+
 class _Innovations(torch.autograd.Function):
-    """z and d (B, N) of points; c is None where it scales the states of a single output."""
+    """z and d (B, N) of points; c scales the states of a single output (and `start` already)."""
 
     @staticmethod
     def forward(ctx: Any, grid: TimeGrid, missing: np.ndarray, *args: Tensor | None) -> Any:
         poles, q, c, start, noise, residual = args
         assert poles is not None
+        assert q is not None
+        assert c is not None
         assert noise is not None
         assert residual is not None
         pairs, (B, _, n_y) = poles.shape[-1], noise.shape
         n = len(grid)
         z, d = np.empty((B, n * n_y)), np.empty((B, n * n_y))
-        lanes = [None if x is None else _to_lanes(array(x)) for x in (poles, q, c, start)]
+        gains = (array(q), array(c)) if n_y > 1 else (_times(array(c), array(q)), None)
+        arrays = (array(poles), *gains, None if start is None else array(start))
+        lanes = [None if x is None else _to_lanes(x) for x in arrays]
         rows = layout.Rows(
             grid.step_index, array(grid.steps), array(noise), missing, array(residual)
         )
@@ -76,16 +86,22 @@ class _Innovations(torch.autograd.Function):
         found = []
         x = layout.records(pairs, layout.SEGMENT * n_y)
         for g, points in enumerate(_groups(lanes)):
-            work, own = layout.workspace(pairs, n_y), layout.bars_of(pairs, n_y, c is not None)
+            work, own = layout.workspace(pairs, n_y), layout.bars_of(pairs, n_y)
             passes.reverse_points(
                 g, points, rows, work, x, kept, own, z_bar, d_bar, residual_bar, noise_bar
             )
             found.append(own)
         size = pairs * (pairs + 1) * 2
+        q_bar = _from_lanes([own.q for own in found], q)
+        if n_y == 1:
+            bar, factors = array(q_bar), (array(c).conj(), array(q).conj())
+            q_bar, c_bar = (torch.from_numpy(_times(x, bar)).to(q.device) for x in factors)
+        else:
+            c_bar = _from_lanes([own.c for own in found if own.c is not None], c)
         gradients = [
             _from_lanes([own.poles for own in found], poles),
-            _from_lanes([own.q for own in found], q),
-            None if c is None else _from_lanes([own.c for own in found if own.c is not None], c),
+            q_bar,
+            c_bar,
             None if start is None else _from_lanes([own.state[:size] for own in found], start),
         ]
         rest = (torch.from_numpy(x).to(poles.device) for x in (noise_bar, residual_bar))
@@ -136,6 +152,7 @@ def innovations(
     *,
     missing: Tensor | None = None,
     explained: Tensor | None = None,
+    output_covariances: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     r"""Innovations and their variances: each sample less its prediction from those before.
 
@@ -152,6 +169,7 @@ def innovations(
         residual: r (*b, N), N = n n_y, samples less mean response [output]; not used where missing.
         missing: (*b, N), True where there is no sample.
         explained: (*b, 2P, 2P) stationary less initial covariance of [Re x; Im x]; None for zero.
+        output_covariances: q (*b, n_y, P) of `fused.output_covariance`, where it is known already.
 
     Returns:
         z (*b, N) [output] and d (*b, N) [output^2], float64. Missing rows have d infinite, z
@@ -168,21 +186,20 @@ def innovations(
         >>> z.shape, bool((d > 0.1).all())
         (torch.Size([2]), True)
     """
-    q = output_covariance(modes)
-    c: Tensor | None = modes.C
-    if modes.outputs == 1:
-        scale, q, c = modes.C[..., 0, :], modes.C * q, None
-    start = None if explained is None else _packed(explained, scale if c is None else None)
-    shapes = [(modes.poles, 1), (q, 2), (c, 2), (start, 1), (noise_variance, 2), (residual, 1)]
-    if missing is not None:
-        shapes.append((missing, 1))
-    batch = broadcast(*(x.shape[: x.dim() - k] for x, k in shapes if x is not None))
+    q = output_covariance(modes) if output_covariances is None else output_covariances
+    start = None
+    if explained is not None:
+        start = _packed(explained, modes.C[..., 0, :] if modes.outputs == 1 else None)
+    shapes: list[tuple[Tensor | None, int]] = [
+        (modes.poles, 1), (q, 2), (modes.C, 2), (start, 1), (noise_variance, 2), (residual, 1),
+    ]  # fmt: skip
+    batch = broadcast(*(x.shape[: x.dim() - k] for x, k in [*shapes, (missing, 1)]
+                        if x is not None))  # fmt: skip
     size = batch.numel()
-    flat = [None if x is None else _flat(x, k, batch) for x, k in shapes]
+    *whole, r = [None if x is None else _flat(x, k, batch) for x, k in shapes]
     absent = np.zeros((0, residual.shape[-1]), dtype=np.bool_)
     if missing is not None:
-        absent = array(flat.pop())  # type: ignore[arg-type]
-    *whole, r = flat
+        absent = array(_flat(missing, 1, batch))
     whole = [None if x is None else x.expand(size, *x.shape[1:]) for x in whole]
     z, d = run(_Innovations, (grid, absent), *whole, r)
     return z.reshape(batch + z.shape[1:]), d.reshape(batch + d.shape[1:])

@@ -116,8 +116,7 @@ class SemiseparableCovariance:
         step, out = grid.rows(modes.outputs)
         S0 = self._explained
         if S0 is None:
-            J = 2 * modes.pairs
-            S0 = torch.zeros(J, J, dtype=torch.float64, device=phi.device)
+            S0 = torch.zeros((2 * modes.pairs,) * 2, dtype=torch.float64, device=phi.device)
         return primitives.Generators(
             re=phi.real,
             im=phi.imag,
@@ -136,10 +135,13 @@ class SemiseparableCovariance:
         return e, p, d, e / d.unsqueeze(-1), S_end
 
     @cached_property
+    def _output_covariances(self) -> Tensor:
+        return output_covariance(self.modes)
+
+    @cached_property
     def _rounding(self) -> Tensor:
         """What innovation variances (*b, 1, n_y) cannot be told from zero: 4 units of rounding."""
-        with torch.no_grad():
-            k0 = 2.0 * (self.modes.C * output_covariance(self.modes)).sum(-1).real
+        k0 = 2.0 * (self.modes.C.detach() * self._output_covariances.detach()).sum(-1).real
         return 4.0 * torch.finfo(torch.float64).eps * k0.abs().unsqueeze(-2)
 
     def _checked(self, d: Tensor) -> Tensor:
@@ -155,12 +157,10 @@ class SemiseparableCovariance:
 
     def _run(self, residual: Tensor) -> tuple[Tensor, Tensor]:
         """Innovations and variances of residuals (..., N), of the batch of both."""
-        missing = self._absent
-        if self._noise.shape[-2] > 1 and bool(torch.isinf(self._noise).any()):
-            missing = self.missing
         z, d = innovations(
-            self.modes, self.grid, self._noise, residual, missing=missing, explained=self._explained
-        )
+            self.modes, self.grid, self._noise, residual, missing=self._absent,
+            explained=self._explained, output_covariances=self._output_covariances,
+        )  # fmt: skip
         if d.shape[:-1] == self.batch_shape:
             self._variances = d
         return z, self._checked(d)
