@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from numba import njit
 
-from pyro_dynogp.lti.innovation_rows import set_propagators
+from pyro_dynogp.lti.innovation_rows import both_products, set_propagators
 from pyro_dynogp.lti.lanes import choose, get, put, splat
 from pyro_dynogp.support.compiled import BORROWING, WITHIN
 
@@ -209,16 +209,7 @@ def covariance_adjoint(x, at, o, phi, f, c, bars):
                 # Both factors of an entry on the diagonal are phi_a: for b = a it is added twice.
                 add(bars.log_phi, b, ar + mr)
                 add(bars.log_phi, b + 1, mi - ai)
-                pbr = get(phi, f + b)
-                pbi = get(phi, f + b + 1)
-                rr = par * pbr
-                ii = pai * pbi
-                ri = par * pbi
-                ir = pai * pbr
-                fr = rr + ii
-                fi = ir - ri
-                gr = rr - ii
-                gi = ir + ri
+                fr, fi, gr, gi = both_products(par, pai, get(phi, f + b), get(phi, f + b + 1))
                 rr = Ar * fr + Ai * fi
                 Ai = Ai * fr - Ar * fi
                 Ar = rr

@@ -55,6 +55,16 @@ def move_mean(x, src, dst, phi, f):
 
 
 @njit(**WITHIN)
+def both_products(ar, ai, br, bi):
+    """Real and imaginary parts of a conj(b), then of a b."""
+    rr = ar * br
+    ii = ai * bi
+    ri = ar * bi
+    ir = ai * br
+    return rr + ii, ir - ri, rr - ii, ir + ri
+
+
+@njit(**WITHIN)
 def move_covariance(x, src, dst, phi, f, q, c, o, e):
     """A and M of the next row's record at dst from the record at src; e of its output o."""
     P = phi.shape[0] // 4
@@ -73,24 +83,12 @@ def move_covariance(x, src, dst, phi, f, q, c, o, e):
         for b in range(a, 2 * P, 2):
             wbr = get(x, w + b)
             wbi = get(x, w + b + 1)
-            rr = war * wbr
-            ii = wai * wbi
-            ri = war * wbi
-            ir = wai * wbr
-            Ar = get(x, src + k) + (rr + ii)
-            Ai = get(x, src + k + 1) + (ir - ri)
-            Mr = get(x, src + k + 2) + (rr - ii)
-            Mi = get(x, src + k + 3) + (ir + ri)
-            pbr = get(phi, f + b)
-            pbi = get(phi, f + b + 1)
-            rr = par * pbr
-            ii = pai * pbi
-            ri = par * pbi
-            ir = pai * pbr
-            fr = rr + ii
-            fi = ir - ri
-            gr = rr - ii
-            gi = ir + ri
+            fr, fi, gr, gi = both_products(war, wai, wbr, wbi)
+            Ar = get(x, src + k) + fr
+            Ai = get(x, src + k + 1) + fi
+            Mr = get(x, src + k + 2) + gr
+            Mi = get(x, src + k + 3) + gi
+            fr, fi, gr, gi = both_products(par, pai, get(phi, f + b), get(phi, f + b + 1))
             rr = fr * Ar - fi * Ai
             Ai = fr * Ai + fi * Ar
             Ar = rr
