@@ -18,7 +18,7 @@ from pyro_dynogp.criticism.kept_draws import kept
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.cascade_coordinates import StraightPotential
 from pyro_dynogp.inference.density import Potential
-from pyro_dynogp.inference.log_joint import log_prob_by_draw
+from pyro_dynogp.inference.log_joint import Traced, log_prob_by_draw
 from pyro_dynogp.inference.methods import annealed as annealing
 from pyro_dynogp.inference.posteriors import Draws, Mixture
 from pyro_dynogp.layers.sites import Arguments, Program
@@ -141,7 +141,7 @@ def judged(fit: Fitted, draws: Draws, kind: str | None = None) -> PosteriorDraws
 def laplace(fit: Fitted, values: Values) -> Mixture:
     """Normal around an optimum, from the Hessian of the log joint density there."""
     with seeded(fit.seed):
-        potential = Potential(fit.model.collapsed, (fit.model.prepare(fit.records),), values)
+        potential = Potential(fit.model.collapsed, _data(fit), values)
         centre, root = potential.laplace(values)
     return Mixture.normal(potential, torch.as_tensor(centre), torch.as_tensor(root))
 
@@ -169,8 +169,7 @@ def _annealed(
             "parameters='mode'.",
         )
     with seeded(seed):
-        prepared = (fit.model.prepare(fit.records),)
-        potential = StraightPotential(fit.model.collapsed, prepared, fit.mode)
+        potential = StraightPotential(fit.model.collapsed, _data(fit), fit.mode)
         loc, root = map(torch.as_tensor, potential.laplace(fit.mode))
         z, start = annealing.around(loc, root, count, seed)
         target = annealing.Joint(potential, _samples(fit.records))
@@ -206,9 +205,8 @@ def carried(
         old: a fit without static functions. draws: of its posterior.
         new: the same with other records. seed: of the moves. progress: whether to show a bar.
     """
-    data = (old.model.prepare(old.records),)
-    before = StraightPotential(old.model.collapsed, data, old.mode)
-    after = before.on((new.model.prepare(new.records),))
+    before = StraightPotential(old.model.collapsed, _data(old), old.mode)
+    after = before.on(_data(new))
     start, target = (
         annealing.Joint(potential, _samples(fit.records))
         for potential, fit in ((before, old), (after, new))
@@ -230,9 +228,7 @@ def carried(
 
 def log_joint(fit: Fitted, values: Values) -> np.ndarray:
     """Log p(y, values) (S,) of draws, y the training records; -inf where it has no value."""
-    return log_joint_of(
-        fit.model.collapsed, (fit.model.prepare(fit.records),), values, _samples(fit.records)
-    )
+    return log_joint_of(fit.model.collapsed, _data(fit), values, _samples(fit.records))
 
 
 def log_joint_of(
@@ -255,9 +251,7 @@ def _portion(model: Program, args: Arguments, values: Values) -> np.ndarray:
     count = len(next(iter(values.values())))
     try:
         with torch.no_grad(), pyro.validation_enabled(False):
-            trace = pyro.poutine.trace(pyro.poutine.condition(model, data=dict(values))).get_trace(
-                *args
-            )
+            trace = Traced(model, args).trace(values)
             trace.compute_log_prob()
     except (NotPositiveDefiniteError, torch.linalg.LinAlgError, ValueError) as error:
         # Pyro wraps what a distribution raises in a ValueError.
@@ -275,6 +269,11 @@ def _portion(model: Program, args: Arguments, values: Values) -> np.ndarray:
             raise invalid("values", expected=f"draws of every site, {name!r} too", got="none of it")
     total = log_prob_by_draw(trace, count).numpy()
     return np.where(np.isfinite(total), total, -np.inf)
+
+
+def _data(fit: Fitted) -> Arguments:
+    """What a fit's model is called with."""
+    return (fit.model.prepare(fit.records),)
 
 
 def _samples(records: Sequence[Record]) -> int:
