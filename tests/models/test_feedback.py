@@ -35,6 +35,24 @@ def test_a_line_in_feedback_is_a_linear_system(outputs, inputs, irregular):
     np.testing.assert_allclose(found.variance, variance, rtol=1e-8, atol=1e-12)
 
 
+@pytest.mark.parametrize("process_noise", [True, False])
+def test_every_site_changes_the_likelihood(process_noise):
+    record = make_record()
+    model = spring(process_noise=process_noise).scaled_to(record)
+    (prepared,) = model.prepare(record)
+    values = values_of(model, record, linear=False)
+
+    def likelihood(v):
+        process = output_process(system_at(model, v), prepared)
+        return float(process.log_prob(record.tensors().observations))
+
+    before = likelihood(values)
+    generator = torch.Generator().manual_seed(0)
+    for name, value in values.items():
+        change = 0.05 + 0.05 * torch.rand(value.shape, dtype=value.dtype, generator=generator)
+        assert abs(likelihood({**values, name: value + change}) - before) > 1e-6, name
+
+
 @pytest.mark.parametrize(("outputs", "inputs", "irregular"), CASES)
 def test_free_runs_of_a_line_in_feedback_are_those_of_the_linear_system(outputs, inputs, irregular):
     _, loop, process = line_case(outputs, inputs, irregular, process_noise=False)
