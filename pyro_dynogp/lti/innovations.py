@@ -41,6 +41,7 @@ def _from_lanes(bars: list[np.ndarray], like: Tensor) -> Tensor:
     return out.reshape(like.shape)
 
 
+@np.errstate(all="ignore")  # out of range the variances are NaN, which the caller refuses
 def _times(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Product of complex arrays, rounded alike in every place, as numpy's own need not be."""
     re = a.real * b.real - a.imag * b.imag

@@ -1,5 +1,7 @@
 """Compiled innovations and their gradients: dense algebra, bits of each point, gains that rest."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
@@ -181,3 +183,14 @@ def test_shared_residuals_and_batches_add_up():
     (together,) = torch.autograd.grad(z.square().sum(), shared)
     (apart,) = torch.autograd.grad(z1.square().sum(), shared)
     assert_close(together, apart, rtol=1e-13)
+
+
+def test_covariances_out_of_range_are_nan_without_a_warning():
+    one = torch.ones(1, dtype=torch.complex128)
+    modes = Modes(tensor([-0.5 + 2.0j]), None, one, one.unsqueeze(-1))
+    q = torch.full((1, 1), torch.inf, dtype=torch.complex128)
+    noise, residual = torch.ones(1, 1).double(), torch.ones(len(EQUAL)).double()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        _, d = innovations(modes, time_grid(EQUAL), noise, residual, output_covariances=q)
+    assert torch.isnan(d).all()
