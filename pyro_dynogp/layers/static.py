@@ -58,7 +58,7 @@ class StaticPrior:
     - the kernel's, see `kernel_sites`; by default ``lengthscale`` (d,), LogNormal(0, 1).
     - ``output_scale`` (e,): LogNormal(0, 1).
     - ``constant`` (e,): normal(0, 1).
-    - ``slope`` (e, d)*: normal(identity where e = d and `identity`, else zero; 1).
+    - ``slope`` (e, d)*: normal(identity where e = d, else zero; 1).
     - one channel: ``center`` (1,)*, normal(0, 1), and ``half_width`` (1,)*, LogNormal(log 3, 0.5),
       of the even grid of locations; several channels, or `locations` given: ``locations`` (M, d)*,
       normal(starting locations, 1).
@@ -74,7 +74,6 @@ class StaticPrior:
         learn_locations: whether the locations are learnt; else they stay at the start.
         locations: starting locations (M, d), or (M,) for one channel; by default
             `starting_locations`.
-        identity: whether the line of as many outputs as channels is the identity a priori.
 
     Raises:
         ValueError: if an option or shape is wrong.
@@ -88,7 +87,6 @@ class StaticPrior:
     mean: MeanName = "constant"
     learn_locations: bool = True
     locations: Any = None
-    identity: bool = True
 
     def __post_init__(self) -> None:
         _check_counts(channels=self.channels, outputs=self.outputs, inducing=self.inducing)
@@ -129,7 +127,7 @@ class StaticPrior:
         ]
         if self.mean == "linear":
             start = torch.zeros(self.outputs, self.channels, dtype=torch.float64)
-            if self.identity and self.outputs == self.channels:
+            if self.outputs == self.channels:
                 start.fill_diagonal_(1.0)
             sites.append(normal(f"{name}_slope", start, (outputs, inputs)))
         if self._even:

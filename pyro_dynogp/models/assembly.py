@@ -22,7 +22,7 @@ from pyro_dynogp.lti.fused import propagators
 from pyro_dynogp.lti.grid import TimeGrid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import mean_response
-from pyro_dynogp.models.filter_functions import Block, functions_of
+from pyro_dynogp.models.filter_functions import Block, functions_of, inducing_range
 from pyro_dynogp.models.system import DynamicSystem, StaticSystem, System
 from pyro_dynogp.models.wiring import INPUTS, Dynamic, Wire
 from pyro_dynogp.moments.problem import FilterProblem, make_layout
@@ -139,9 +139,14 @@ class _Assembler:
         rows[torch.arange(count), self.states + first + torch.arange(count)] = 1.0
         return rows
 
-    def add_block(self, signal: Signal, function: StaticFunction | None, last: bool) -> Signal:
+    def add_block(
+        self, signal: Signal, function: StaticFunction | None, last: bool, back: bool = False
+    ) -> Signal:
         assert signal.rows is not None
-        block = Block(signal.rows, signal.known, function, with_variance=last)
+        # A run that leaves the data must come back: no table that ends keeps it from that.
+        single = back and function is not None and function.channels == 1
+        ends = inducing_range(function) if single and function is not None else None
+        block = Block(signal.rows, signal.known, function, last, ends)
         self.blocks.append(block)
         first, count = self.outputs_before, block.outputs
         self.outputs_before += count
@@ -153,7 +158,8 @@ class _Assembler:
     def static(self, one: Wire, layer: StaticSystem) -> Signal:
         seen = self.sources(one)
         if seen.rows is not None:
-            return self.add_block(seen, layer.function, not one.pathwise)
+            back = any(one.name in w.feedback for w in self.system.wires)
+            return self.add_block(seen, layer.function, not one.pathwise, back)
         known = layer(seen.known)
         if one.last:
             self.extra = layer.function.variance(seen.known)

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.layers.functions import StaticFunction, even_grid
-from pyro_dynogp.moments.functions import KERNELS
-from pyro_dynogp.moments.problem import TABLE
+from pyro_dynogp.moments.functions import KERNELS, TABLE, TANGENTS
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.tensors import broadcast
 
@@ -23,12 +22,16 @@ GRID = 801
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """One static function inside the filter: its inputs, and how it is evaluated."""
+    """One static function inside the filter: its inputs, and how it is evaluated.
+
+    ends: range beyond which a function of one channel goes on as its tangents, None for none.
+    """
 
     rows: Tensor
     known: Tensor
     function: StaticFunction | None  # None: the identity
     with_variance: bool
+    ends: tuple[Tensor, Tensor] | None = None
 
     @property
     def channels(self) -> int:
@@ -101,19 +104,14 @@ def _function(block: Block, M: int, widest: int) -> tuple[int, dict[str, Tensor]
         values["slope"] = torch.eye(d, widest, dtype=torch.float64)
         return KERNELS["rbf"], values
     if d == 1:
-        low, high = table_range(function)
-        grid = even_grid(low, high, GRID).unsqueeze(-1)
-        mean, variance = function.moments(grid)
-        if function.slope is not None and not block.with_variance:
-            # The line is no part of the table, so that it goes on beyond it.
-            values["slope"] = torch.nn.functional.pad(function.slope, (0, widest - 1))
-            mean = mean - grid @ function.slope.mT
+        low, high = block.ends or table_range(function)
+        mean, variance = function.moments(even_grid(low, high, GRID).unsqueeze(-1))
         values["table_mean"] = mean.mT
         if block.with_variance:
             values["table_variance"] = variance.mT
         values["low"] = low.unsqueeze(-1)
         values["spacing"] = ((high - low) / (GRID - 1)).unsqueeze(-1)
-        return TABLE, values
+        return TABLE if block.ends is None else TANGENTS, values
     radial = function.kernel.radial
     if radial is None:
         raise invalid(
@@ -138,14 +136,19 @@ def _function(block: Block, M: int, widest: int) -> tuple[int, dict[str, Tensor]
     return KERNELS[name], values
 
 
+def inducing_range(function: StaticFunction) -> tuple[Tensor, Tensor]:
+    """First and last inducing location (*b) of a function of one channel."""
+    z = function.locations.squeeze(-1)
+    return z.amin(-1), z.amax(-1)
+
+
 def table_range(function: StaticFunction) -> tuple[Tensor, Tensor]:
     """Range (*b) of a function's table: where it has inducing points, and well beyond.
 
     It moves with the parameters, and gradients know: a table that did not would leave steps in the
     likelihood.
     """
-    z = function.locations.squeeze(-1)
-    low, high = z.amin(-1), z.amax(-1)
+    low, high = inducing_range(function)
     margin = 0.5 * (high - low)
     if function.kernel.radial is not None:
         # A function is back at its prior mean within some lengthscales.

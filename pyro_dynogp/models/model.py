@@ -324,7 +324,8 @@ class Model:
             fed=place.fed,
         )
 
-    def _static_prior(self, place: Wire, layer: Static) -> StaticPrior:
+    @staticmethod
+    def _static_prior(place: Wire, layer: Static) -> StaticPrior:
         return StaticPrior(
             place.name,
             channels=place.channels,
@@ -333,7 +334,6 @@ class Model:
             kernel=layer.kernel,
             mean=layer.mean or "constant",
             learn_locations=layer.learn_locations,
-            identity=not any(place.name in w.feedback for w in self.wires),
         )
 
     def _has_residual(self, place: Wire) -> bool:

@@ -51,7 +51,8 @@ class Static:
         outputs: width of the layer. inducing: number of inducing values for each output.
         kernel: a gpytorch kernel; Matern-3/2 with a lengthscale for each channel by default.
         mean: "linear" or "constant" prior mean; by default linear for a first layer, in feedback
-            and where there are limits, else constant. Beyond the data a function goes back to it.
+            from several signals and where there are limits, else constant. Beyond the data a
+            function goes back to it; in feedback from one signal it goes on as its tangents.
         limits: lowest and highest value of the linear mean [output], None for none: those of a
             sensor that stops. Of a last layer of one signal and one output.
         skip: names of earlier signals that the layer sees too.
@@ -164,7 +165,8 @@ def wire(inputs: int, layers: Sequence[Layer], output: str | None = None) -> tup
                 raise invalid(
                     f"layer {name!r}", expected="inputs for a static layer", got="no channels"
                 )
-            linear = place == 0 or name in back or layer.limits is not None
+            fed = name in back and channels > 1
+            linear = place == 0 or fed or layer.limits is not None
             layer = replace(layer, mean=layer.mean or ("linear" if linear else "constant"))
             if layer.limits is not None:
                 _check_limits(name, layer, channels, name == output and name not in back)

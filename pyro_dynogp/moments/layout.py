@@ -20,7 +20,7 @@ class Layout(NamedTuple):
     Attributes:
         step: (n,) index of the distinct step that leads to each sample, -1 for none.
         channels, outputs: (S,) inputs d and outputs e of each static layer.
-        form: (S,) TABLE or a radial kernel.
+        form: (S,) TABLE, TANGENTS or a radial kernel.
         g_start, f_start: (S + 1,) where the layer's inputs and outputs start among all.
         nodes: (S, Q, d_max), node_weight: (S, Q), node_count: (S,).
         share, multiple: (K,) weights and variance multiples of the noise's Gaussian components.
@@ -53,7 +53,7 @@ class Values(NamedTuple):
         table_mean, table_variance: (E, grid) of tabulated functions.
         low, spacing: (S,) first point and spacing of the grid.
         weight: (E, M), Z: (S, M, d_max), inverse: (S, d_max), constant: (E,), slope: (E, d_max):
-            of radial expansions; slope also of the line beside a table (not of a measured one).
+            of radial expansions.
         H: (n_y, A) rows of the outputs. y_offset: (n, n_y) their known part.
         y: (n, n_y) measured, NaN where missing. R: (n, n_y) variance of the noise.
     """

@@ -132,16 +132,16 @@ def _average(i, layout, values, mean, block, work):
             block[a, b] = 0.0
         for c in range(d):
             cross[c, a] = 0.0
-    grid = values.table_mean.shape[1]
+    grid, form = values.table_mean.shape[1], layout.form[i]
     for q in range(layout.node_count[i]):
         xi = layout.nodes[i, q]
         wq = layout.node_weight[i, q]
         _node(i, q, layout, work)
         f = work.f[i, q]
-        if layout.form[i] == TABLE:
-            k = locate(z[0], values.low[i], values.spacing[i], grid, weight4, slope4)
+        if form <= TABLE:
+            k = locate(z[0], values.low[i], values.spacing[i], grid, form, weight4, slope4)
             for a in range(e):
-                total = values.slope[f0 + a, 0] * z[0]
+                total = 0.0
                 variance = 0.0
                 for b in range(4):
                     total += weight4[b] * values.table_mean[f0 + a, k + b]
@@ -225,7 +225,7 @@ def _average_adjoint(i, layout, values, bars, m, m_bar, P_bar, work):
     na = values.m0.shape[0] + f0
     z, z_bar, w4, s4 = work.z, work.z_bar, work.weight4, work.slope4
     f_bar = work.f_bar[:e]
-    grid = values.table_mean.shape[1]
+    grid, form = values.table_mean.shape[1], layout.form[i]
     for q in range(layout.node_count[i]):
         xi = layout.nodes[i, q]
         wq = layout.node_weight[i, q]
@@ -239,13 +239,10 @@ def _average_adjoint(i, layout, values, bars, m, m_bar, P_bar, work):
             for b in range(e):
                 total += 2.0 * P_bar[na + a, na + b] * (f[b] - m[na + b])
             f_bar[a] = wq * total
-        if layout.form[i] == TABLE:
-            k = locate(z[0], values.low[i], values.spacing[i], grid, w4, s4)
-            line_bar = 0.0
+        if form <= TABLE:
+            k = locate(z[0], values.low[i], values.spacing[i], grid, form, w4, s4)
             for a in range(e):
                 v_bar = wq * P_bar[na + a, na + a]
-                bars.slope[f0 + a, 0] += f_bar[a] * z[0]
-                line_bar += f_bar[a] * values.slope[f0 + a, 0]
                 for b in range(4):
                     bars.table_mean[f0 + a, k + b] += f_bar[a] * w4[b]
                     bars.table_variance[f0 + a, k + b] += v_bar * w4[b]
@@ -256,7 +253,6 @@ def _average_adjoint(i, layout, values, bars, m, m_bar, P_bar, work):
             # The grid itself may move: f depends on (z - low) / spacing.
             bars.low[i] -= z_bar[0]
             bars.spacing[i] -= z_bar[0] * (z[0] - values.low[i]) / values.spacing[i]
-            z_bar[0] += line_bar
         else:
             part, part_bar = expansion_of(i, layout, values), expansion_of(i, layout, bars)
             expansion_adjoint(layout.form[i], z[:d], part, f_bar, z_bar[:d], part_bar)

@@ -14,7 +14,7 @@ def spring(outputs=1, pairs=2, inputs=1, process_noise=True, **options):
     """A layer g whose output comes back through a function f of all of it."""
     layers = (
         Dynamic(outputs=outputs, pairs=pairs, process_noise=process_noise, feedback=("f",)),
-        Static(outputs=outputs, inducing=6),
+        Static(outputs=outputs, inducing=6, mean="linear"),
     )
     return dgp.Cascade(inputs, layers, output="g", **options)
 

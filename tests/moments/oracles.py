@@ -44,11 +44,10 @@ def evaluate(layout, values, i, z):
     own = slice(layout.f_start[i], layout.f_start[i + 1])
     if layout.form[i] == TABLE:
         place = (values.low[i], values.spacing[i], z[:, 0])
-        mean, variance = (
+        return tuple(
             np.stack([interpolate(row, *place) for row in table[own]], -1)
             for table in (values.table_mean, values.table_variance)
         )
-        return mean + z @ values.slope[own, :1].T, variance
     d = z.shape[1]
     name = {v: k for k, v in KERNELS.items()}[int(layout.form[i])]
     scaled = (z[:, None] - values.Z[i][None, :, :d]) * values.inverse[i, :d]

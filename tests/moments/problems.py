@@ -102,8 +102,6 @@ def random_problem(
         "y": y,
         "R": rng.uniform(0.1, 1.1, (n, n_y)),
     }
-    if measured:  # no line beside a table that is measured
-        values["slope"][layout.f_start[-2] :] = 0.0
     return FilterProblem(layout, **{k: torch.from_numpy(np.array(v)) for k, v in values.items()})
 
 

@@ -8,7 +8,7 @@ import torch
 
 from pyro_dynogp.moments.filtering import SEGMENT
 from pyro_dynogp.moments.layout import Values
-from pyro_dynogp.moments.problem import _EVENTS, log_density
+from pyro_dynogp.moments.problem import EVENTS, log_density
 from tests.moments import oracles
 from tests.moments.problems import (
     LINE,
@@ -56,8 +56,8 @@ def used(problem):
     names = set(Values._fields)
     if 0 not in forms:
         names -= set(TABLES)
-    if not forms - {0}:  # a table has a line beside it, but not where it is measured
-        names -= set(RADIAL) - ({"slope"} if len(layout.form) > (layout.measured >= 0) else set())
+    if not forms - {0}:
+        names -= set(RADIAL)
     if not len(layout.form):
         names -= {"G", "offset", "gamma"}
     if layout.measured >= 0:
@@ -131,7 +131,7 @@ def pick(problem, index):
     picked = {}
     for name in Values._fields:
         x = getattr(problem, name)
-        event = x.shape[x.dim() - _EVENTS[name] :]
+        event = x.shape[x.dim() - EVENTS[name] :]
         picked[name] = x.expand((2, 3, *event))[index].detach()
     return replace(problem, **picked)
 

@@ -142,11 +142,10 @@ def starting_point(model: Model, records: Sequence[Record], scaling: Scaling, pl
                 known = [torch.where(y.isnan(), s, y - level) for y, s in zip(targets, seen, strict=True)]
                 seen = known if one.name in back else seen
             line = (size, level) if one.last else None
-            if one.name in back and not one.last:  # nothing comes back as yet
-                line = (0.0, torch.zeros(one.layer.outputs, dtype=torch.float64))
             curve = torch.cat(targets) if one.last and plan.curved else None
             reach = torch.cat(targets) if one.last else None
-            outputs = start_static(model, one, one.layer, values, seen, line, curve, reach)
+            fed = one.name in back
+            outputs = start_static(model, one, one.layer, values, seen, line, curve, reach, fed)
         for signal, out in zip(signals, outputs, strict=True):
             signal[one.name] = out
     last = model.output_wire.name

@@ -22,13 +22,15 @@ def start_static(
     line: tuple[float, Tensor] | None,
     curve: Tensor | None,
     reach: Tensor | None,
+    back: bool = False,
 ) -> list[Tensor]:
     """Add a static layer's values; its outputs along the mean trajectories.
 
     Args:
-        line: slope and level (e,) of the function, None for the identity; slope 0 without `reach`.
+        line: slope and level (e,) of the function, None for the identity.
         curve: (n, e) what its outputs should be on average; None for a straight line.
         reach: (n, e) outputs that the straight line should be able to reach, or None.
+        back: whether it is in feedback; nothing comes back at first.
     """
     x = torch.cat(list(seen))
     d, e, M = one.channels, layer.outputs, layer.inducing
@@ -38,7 +40,8 @@ def start_static(
         back = (reach - line[1]) / line[0]
         back = back[torch.isfinite(back)]
         low, high = torch.minimum(low, back.amin()), torch.maximum(high, back.amax())
-    margin = 0.2 * (high - low) + 1e-3
+    # A function in feedback goes on from there as it ends there.
+    margin = (0.02 if back else 0.2) * (high - low) + 1e-3
     low, high = low - margin, high + margin
     name = one.name
     if not layer.learn_locations:
@@ -53,8 +56,7 @@ def start_static(
     values[f"{name}_constant"] = torch.zeros(e, dtype=torch.float64)
     values[f"{name}_output_scale"] = torch.full((e,), 1.5, dtype=torch.float64)
     if layer.mean == "linear":
-        level = line is not None and line[0] == 0.0
-        slope = torch.zeros if level else torch.eye
+        slope = torch.zeros if back else torch.eye
         values[f"{name}_slope"] = slope(e, d, dtype=torch.float64)
     if layer.kernel is None:
         spread = (high - low) / (4.0 if d == 1 else 1.5)
@@ -67,6 +69,7 @@ def start_static(
         u = line[0] * u + line[1].unsqueeze(-1)
     if curve is not None and d == 1:
         u = torch.stack([_smooth_means(x[:, 0], curve[:, o], Z[:, 0]) for o in range(e)])
+    u = torch.zeros_like(u) if back else u
     u = u.clamp(*function.limits)
     values[f"{name}_values"] = _whiten(function, u)
     function = _function(model, one, layer, values)

@@ -1,0 +1,135 @@
+"""A fitted spring through every verb, and what feedback refuses."""
+
+import numpy as np
+import pytest
+import torch
+
+import pyro_dynogp as dgp
+from pyro_dynogp.inference.free_runs import free_run_error
+from tests.models.closed_loops import spring
+
+STEP = 0.05
+
+
+def duffing(n, seed, noise=0.02):
+    """x'' + 0.6 x' + 4 x + 4 x^3 = u, measured with noise; the true output."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(5.0 * rng.standard_normal(n // 4 + 1), 4)[:n]
+    x, v, out = 0.0, 0.0, np.empty(n)
+    for k in range(n):
+        out[k] = x
+        for _ in range(20):
+            v += STEP / 20 * (u[k] - 0.6 * v - 4.0 * x - 4.0 * x**3)
+            x += STEP / 20 * v
+    y = out + noise * out.std() * rng.standard_normal(n)
+    y[[5, n // 2]] = np.nan
+    return dgp.Record(time=STEP * np.arange(n), inputs=u, outputs=y), out, noise * out.std()
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    record, _, _ = duffing(600, 0)
+    options = {"workers": 1, "progress": False, "restarts": 2, "seed": 0}
+    return dgp.fit(dgp.NonlinearFeedback(1), record[:450], **options), record
+
+
+def test_free_runs_find_the_spring_again(fitted):
+    """Near the noise, where the linear model is far; the climb ends without process noise."""
+    fit, record = fitted
+    _, truth, sd = duffing(600, 0)
+    forecast = fit.forecast(record[:450], record[450:])
+    error = forecast.mean[:, 0] - truth[450:]
+    linear = dgp.fit(dgp.LinearDynamicGP(1, pairs=2), record[:450], workers=1, progress=False)
+    other = linear.forecast(record[:450], record[450:]).mean[:, 0] - truth[450:]
+    assert np.sqrt(np.mean(error**2)) < 1.5 * sd
+    assert np.sqrt(np.mean(error**2)) < 0.2 * np.sqrt(np.mean(other**2))
+    low, high = forecast.quantile([0.025, 0.975])[..., 0]
+    inside = (low < record.outputs[450:, 0]) & (record.outputs[450:, 0] < high)
+    assert 0.85 < inside.mean() <= 1.0
+    causes = sum(forecast.parts[name] for name in forecast.parts)
+    np.testing.assert_allclose(causes, forecast.variance, rtol=1e-8)
+    assert not forecast.parts["process noise of g"].max() > 0.01 * sd**2
+
+
+def test_every_verb(fitted, tmp_path):
+    fit, record = fitted
+    train, later = record[:450], record[450:]
+    ahead = fit.predict(train, horizon=5)
+    assert np.isfinite(ahead.mean).all()
+    one = fit.predict(train)
+    scores = fit.innovations(train)
+    assert np.nanstd(scores) == pytest.approx(1.0, abs=0.25)
+    layers = fit.layers(train)
+    np.testing.assert_allclose(
+        fit.scaling.output_scale * (layers["g"].mean + fit.mode["offset"].numpy())
+        + fit.scaling.output_offset,
+        one.mean,
+        atol=0.1 * float(fit.scaling.output_scale[0]),
+    )
+    assert set(layers) == {"g", "f"}
+    assert fit.static_function("f", train).mean.shape == (200, 1)
+    assert np.isfinite(fit.log_likelihood(train)).all()
+    loo = dgp.loo(fit)
+    assert np.isfinite(loo.elpd)
+    posterior = fit.to_arviz(future=later, samples=20, prior_samples=20)
+    assert posterior.posterior["g_input_gain"].dims[2:] == ("pair", "g_input", "term")
+    assert list(posterior.posterior["g_input"].values) == ["u", "f"]
+    assert list(posterior.posterior["g_feedthrough"].dims[2:]) == ["input"]
+    assert np.isfinite(posterior.posterior_predictive["y"]).all()
+    mode = fit.at_mode()
+    path = tmp_path / "spring.safetensors"
+    fit.save(path)
+    again = dgp.load(path)
+    assert again.model == fit.model
+    for verb in (lambda f: f.simulate(later), lambda f: f.forecast(train, later)):
+        np.testing.assert_array_equal(verb(again).mean, verb(fit).mean)
+        assert np.isfinite(verb(mode).mean).all()
+
+
+def test_several_records_and_another_step():
+    """Two records, one on irregular times; a forecast over other steps than the training's."""
+    whole, _, _ = duffing(360, 1)
+    keep = np.sort(np.random.default_rng(0).choice(np.arange(180, 360), 120, replace=False))
+    records = [whole[:180], whole[keep]]
+    options = {"workers": 1, "progress": False, "restarts": 1, "steps": 20, "method": "map"}
+    fit = dgp.fit(dgp.NonlinearFeedback(1), records, **options)
+    assert {"g_initial_state_0", "g_initial_state_1"} <= set(fit.mode)
+    error = free_run_error(fit.model.collapsed, fit.mode, fit.records)
+    assert 0.0 < error < 1.0
+    assert np.isfinite(fit.forecast(records[0], records[1]).mean).all()
+
+
+def test_same_bits_with_one_and_two_workers():
+    record, _, _ = duffing(120, 2)
+    options = {"progress": False, "restarts": 2, "steps": 6, "method": "map"}
+    one, two = (
+        dgp.fit(dgp.NonlinearFeedback(1), record, workers=workers, **options) for workers in (1, 2)
+    )
+    for name, value in one.mode.items():
+        assert torch.equal(value, two.mode[name]), name
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: spring(integrate="none"), "cannot be sample sites"),
+        (lambda: spring(likelihood=dgp.Heteroscedastic(of="output")), "varies with the inputs"),
+        (lambda: dgp.Cascade(1, (dgp.Dynamic(feedback=("g",)),)), "later static layers"),
+        (lambda: dgp.Cascade(1, (dgp.Dynamic(feedback="f"), dgp.Static())), "a tuple of names"),
+        (
+            lambda: dgp.Cascade(1, (dgp.Static(), dgp.Dynamic(feedback=("f",)))),
+            "of later static layers, of []",
+        ),
+        (lambda: dgp.Cascade(1, (dgp.Dynamic(), dgp.Static()), output="h"), "one of the layers"),
+        (lambda: dgp.Cascade(1, (dgp.Dynamic(), dgp.Static()), output="g"), "without effect"),
+    ],
+)
+def test_what_is_refused_with_a_sentence(make, text):
+    with pytest.raises(ValueError, match=text.replace("[", r"\[")):
+        make()
+
+
+def test_trajectories_as_sites_are_refused_before_work():
+    record, _, _ = duffing(60, 3)
+    with pytest.raises(ValueError, match="feedback"):
+        dgp.fit(dgp.NonlinearFeedback(1), record, guide="gauss-markov")
