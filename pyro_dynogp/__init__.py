@@ -53,8 +53,8 @@ if TYPE_CHECKING:  # the same names, for editors and type checkers; a test compa
     from pyro_dynogp.models.architectures import Cascade as Cascade
     from pyro_dynogp.models.architectures import Hammerstein as Hammerstein
     from pyro_dynogp.models.architectures import HammersteinWiener as HammersteinWiener
-    from pyro_dynogp.models.architectures import NonlinearFeedback as NonlinearFeedback
     from pyro_dynogp.models.architectures import LinearDynamicGP as LinearDynamicGP
+    from pyro_dynogp.models.architectures import NonlinearFeedback as NonlinearFeedback
     from pyro_dynogp.models.architectures import Wiener as Wiener
     from pyro_dynogp.models.architectures import WienerHammerstein as WienerHammerstein
     from pyro_dynogp.models.model import Model as Model

@@ -187,7 +187,7 @@ class DrawnFunction(StaticFunction):
     """One function that is known everywhere: `whitened` holds the weights of the kernel."""
 
     @property
-    def weights(self) -> Tensor:  # type: ignore[override]
+    def weights(self) -> Tensor:
         """Weights (*b, e, M), scale included."""
         return self.whitened
 

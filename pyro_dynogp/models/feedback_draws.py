@@ -23,7 +23,7 @@ from pyro_dynogp.models.draws import (
 )
 from pyro_dynogp.models.filter_functions import Block, functions_of
 from pyro_dynogp.models.system import StaticSystem, System, see
-from pyro_dynogp.models.wiring import INPUTS, Static
+from pyro_dynogp.models.wiring import Static
 from pyro_dynogp.moments.problem import EVENTS, each
 from pyro_dynogp.moments.stepping import step_through
 
@@ -85,7 +85,10 @@ def _step(
     random_rows = [s.rows for s in assembly.signals.values() if s.rows is not None]
     rows = torch.cat([r.expand((*batch, *r.shape[-2:])) for r in random_rows], -2)
     root = root.expand((*batch, *root.shape[-3:]))
-    roots, lines = array(root.reshape(-1, *root.shape[-3:])), array(rows.reshape(-1, *rows.shape[-2:]))
+    roots, lines = (
+        array(root.reshape(-1, *root.shape[-3:])),
+        array(rows.reshape(-1, *rows.shape[-2:])),
+    )
     element = torch.arange(len(elements)).reshape(batch).expand(lead).flatten().tolist()
 
     def one(index: int) -> np.ndarray:

@@ -165,8 +165,8 @@ def wire(inputs: int, layers: Sequence[Layer], output: str | None = None) -> tup
                 raise invalid(
                     f"layer {name!r}", expected="inputs for a static layer", got="no channels"
                 )
-            fed = name in back and channels > 1
-            linear = place == 0 or fed or layer.limits is not None
+            looped = name in back and channels > 1
+            linear = place == 0 or looped or layer.limits is not None
             layer = replace(layer, mean=layer.mean or ("linear" if linear else "constant"))
             if layer.limits is not None:
                 _check_limits(name, layer, channels, name == output and name not in back)

@@ -1,8 +1,9 @@
 r"""Compiled evaluation of static functions inside a recursion, with derivatives.
 
 Two forms. A function of one channel is a table on an even grid, interpolated by cubic convolution
-(Keys 1981, IEEE ASSP 29:1153; the parameter -1/2), held at its ends or, in feedback, going on as its tangents
-there: any kernel fits, since the table is computed outside. A function of several channels is an expansion in a radial kernel,
+(Keys 1981, IEEE ASSP 29:1153; the parameter -1/2), held at its ends or, in feedback, going on as
+its tangents there: any kernel fits, since the table is computed outside. A function of several
+channels is an expansion in a radial kernel,
 
     f_e(z) = constant_e + slope_e . z + sum_m weight_em kappa(r_m),
     r_m^2 = sum_c ((z_c - Z_mc) s_c)^2.

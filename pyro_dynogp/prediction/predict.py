@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,6 +22,8 @@ from pyro_dynogp.support.parallel import seeded
 if TYPE_CHECKING:
     from pyro_dynogp.inference.fitted import Fitted
 
+# Widths of the range of the training outputs beyond which a free run has diverged.
+FAR = 3.0
 # In the kind of a k-step prediction whose joint samples depend on each other as its errors do.
 JOINT = ", errors drawn jointly"
 
@@ -69,11 +72,29 @@ def _forward(
 ) -> Prediction:
     """Outputs from a first state and the inputs."""
     found = outputs.components(samples=samples, seed=seed, several_channels=not fit.collapsed)
+    if fit.model.has_feedback:
+        warn_of_divergence(fit, record, found.mean, kind)
     names = fit.scaling.output_names
     return Prediction(
         record.time, names, found.mean, found.variance, found.noise_variance,
         Parts(found.parts), found.draw, kind,
     )  # fmt: skip
+
+
+def warn_of_divergence(fit: Fitted, record: Record, runs: np.ndarray, kind: str) -> None:
+    """Warn where free runs (S, n, n_y) leave the range of the training outputs far behind."""
+    known = np.concatenate([one.outputs for one in fit.records])
+    low, high = np.nanmin(known, 0), np.nanmax(known, 0)
+    margin = FAR * (high - low)
+    left = ~((runs > low - margin) & (runs < high + margin)).all(-1)
+    if left.any():
+        first = int(left.any(0).argmax())
+        warnings.warn(
+            f"{kind}: {left.any(1).mean():.0%} of the free runs leave the range of the training "
+            f"outputs by more than {FAR:g} times its width, first at sample {first} (time "
+            f"{record.time[first]:.6g}). What follows is no prediction.",
+            stacklevel=5,
+        )
 
 
 def predict(

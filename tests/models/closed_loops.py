@@ -107,7 +107,7 @@ class ClosedLoop:
         return total, np.array(means), np.array(covariances)
 
     def simulate(self, functions, rng):
-        """Scaled outputs (S, n, n_y) of runs with one function (S, m) -> (S, m) each beside the line.
+        """Scaled outputs (S, n, n_y) of runs, each with a function of its own beside the line.
 
         Process and measurement noise act; the output is one, and no input acts on it at once.
         """

@@ -38,7 +38,7 @@ from pyro_dynogp.support.parallel import seeded
 # Starts and iterations of the linear fits that come first.
 LINEAR_STARTS = 6
 LINEAR_STEPS = 150
-# Sets of starts of a model with feedback, until one beats the linear model in free runs; and what is
+# Sets of starts of a model with feedback, until one beats the linear model in free runs; what is
 # said where none does.
 ATTEMPTS = 2
 NO_BETTER = (

@@ -139,7 +139,9 @@ def starting_point(model: Model, records: Sequence[Record], scaling: Scaling, pl
         else:
             assert isinstance(one.layer, Static)
             if one.sources == (model.output_wire.name,):  # seen where it was measured
-                known = [torch.where(y.isnan(), s, y - level) for y, s in zip(targets, seen, strict=True)]
+                known = [
+                    torch.where(y.isnan(), s, y - level) for y, s in zip(targets, seen, strict=True)
+                ]
                 seen = known if one.name in back else seen
             line = (size, level) if one.last else None
             curve = torch.cat(targets) if one.last and plan.curved else None

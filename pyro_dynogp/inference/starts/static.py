@@ -22,7 +22,7 @@ def start_static(
     line: tuple[float, Tensor] | None,
     curve: Tensor | None,
     reach: Tensor | None,
-    back: bool = False,
+    fed_back: bool = False,
 ) -> list[Tensor]:
     """Add a static layer's values; its outputs along the mean trajectories.
 
@@ -30,7 +30,7 @@ def start_static(
         line: slope and level (e,) of the function, None for the identity.
         curve: (n, e) what its outputs should be on average; None for a straight line.
         reach: (n, e) outputs that the straight line should be able to reach, or None.
-        back: whether it is in feedback; nothing comes back at first.
+        fed_back: whether it is in feedback; nothing comes back at first.
     """
     x = torch.cat(list(seen))
     d, e, M = one.channels, layer.outputs, layer.inducing
@@ -41,7 +41,7 @@ def start_static(
         back = back[torch.isfinite(back)]
         low, high = torch.minimum(low, back.amin()), torch.maximum(high, back.amax())
     # A function in feedback goes on from there as it ends there.
-    margin = (0.02 if back else 0.2) * (high - low) + 1e-3
+    margin = (0.02 if fed_back else 0.2) * (high - low) + 1e-3
     low, high = low - margin, high + margin
     name = one.name
     if not layer.learn_locations:
@@ -56,7 +56,7 @@ def start_static(
     values[f"{name}_constant"] = torch.zeros(e, dtype=torch.float64)
     values[f"{name}_output_scale"] = torch.full((e,), 1.5, dtype=torch.float64)
     if layer.mean == "linear":
-        slope = torch.zeros if back else torch.eye
+        slope = torch.zeros if fed_back else torch.eye
         values[f"{name}_slope"] = slope(e, d, dtype=torch.float64)
     if layer.kernel is None:
         spread = (high - low) / (4.0 if d == 1 else 1.5)
@@ -69,7 +69,7 @@ def start_static(
         u = line[0] * u + line[1].unsqueeze(-1)
     if curve is not None and d == 1:
         u = torch.stack([_smooth_means(x[:, 0], curve[:, o], Z[:, 0]) for o in range(e)])
-    u = torch.zeros_like(u) if back else u
+    u = torch.zeros_like(u) if fed_back else u
     u = u.clamp(*function.limits)
     values[f"{name}_values"] = _whiten(function, u)
     function = _function(model, one, layer, values)
