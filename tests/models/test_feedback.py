@@ -60,7 +60,7 @@ def test_process_noise_of_free_runs_is_that_of_the_linear_system(outputs, irregu
 
 
 def test_runs_with_drawn_functions_are_those_of_a_plain_simulation():
-    """Functions from their dense conditional, states step by step in numpy; KS at ten times in all."""
+    """Functions from their dense conditional, states stepped in numpy; KS ten times."""
     count = 300
     model = spring()
     record = make_record(irregular=True, missing=False)

@@ -71,7 +71,7 @@ def test_every_verb(fitted, tmp_path):
     assert set(layers) == {"g", "f"}
     assert fit.static_function("f", train).mean.shape == (200, 1)
     assert np.isfinite(fit.log_likelihood(train)).all()
-    loo = dgp.loo(fit, train, target="missing sample")
+    loo = dgp.loo(fit, train, target="missing sample", parameters="mode", progress=False)
     assert np.isfinite(loo.elpd)
     posterior = fit.to_arviz(future=later, samples=20, prior_samples=20)
     assert posterior.posterior["g_input_gain"].dims[2:] == ("pair", "g_input", "term")
@@ -93,7 +93,7 @@ def test_runs_that_diverge_are_reported_where_they_do(fitted):
     mode = fit.at_mode()
     gain = mode.mode["g_input_gain"].clone()
     gain[:, 1] *= -20.0  # what pulled back drives away
-    wild = mode.with_draws({k: v for k, v in mode.draws.items()} | {"g_input_gain": gain[None]})
+    wild = mode.with_draws(dict(mode.draws) | {"g_input_gain": gain[None]})
     with pytest.warns(UserWarning, match=r"simulation: .* first at sample \d+ "):
         wild.simulate(record)
     with warnings.catch_warnings():
