@@ -9,12 +9,21 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.signals import hermite, hinges
 from pyro_dynogp.effects.base import Effect
 from pyro_dynogp.models.variants import Model, with_output_function
-from pyro_dynogp.statistics.detecting import about, binned, evidence, labelled, lasting, unexplained
+from pyro_dynogp.statistics.detecting import lasting
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
+from pyro_dynogp.statistics.pictures import (
+    about,
+    binned,
+    evidence,
+    labelled,
+    residual_axis,
+    unexplained,
+)
 from pyro_dynogp.statistics.regression import with_past
+from pyro_dynogp.statistics.settings import LoopSettings
 
 
-def output_nonlinearity(residuals: Residuals, *, seed: int = 0) -> Evidence:
+def output_nonlinearity(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> Evidence:
     """Test for a function of the mean alone, beyond the mean itself.
 
     Variants: Hermite polynomials of the second and third degree, apart and together, and piecewise
@@ -22,23 +31,20 @@ def output_nonlinearity(residuals: Residuals, *, seed: int = 0) -> Evidence:
     1969). `where` is empty.
 
     Raises:
-        ValueError: where fewer than 30 samples are held out and measured.
+        ValueError: where too few samples are held out and measured.
     """
     r = residuals
     powers, bends = hermite(r.mean), hinges(r.mean)
     variants = [powers[:, :1], powers[:, 1:], powers, bends, *bends.T]
     variants, nuisance = [with_past(v) for v in variants], with_past(r.mean)
-    found = lasting(r, variants, nuisance, seed)
-    axes = (
-        labelled(f"simulated {r.output_name}", r.output_unit),
-        labelled("residual", r.output_unit),
-    )
+    scan = lasting(r, variants, nuisance, settings, seed)
+    axes = (labelled(f"simulated {r.output_name}", r.output_unit), residual_axis(r))
     return evidence(
         "output nonlinearity",
-        found,
+        scan,
         {},
-        f"'{r.output_name}' is a nonlinear function of what the model says{about(r, found)}.",
-        binned(r, r.mean, unexplained(r, nuisance, found.fitted), found.fitted, axes),
+        f"'{r.output_name}' is a nonlinear function of what the model says, {about(r, scan.size)}.",
+        binned(r, r.mean, unexplained(r, nuisance, scan.fitted), scan.fitted, axes),
     )
 
 

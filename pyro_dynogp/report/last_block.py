@@ -14,7 +14,6 @@ from pyro_dynogp.discrepancy.decision import Confirmed
 from pyro_dynogp.discrepancy.parameters import parameters_of
 from pyro_dynogp.discrepancy.result import FoundEffect
 from pyro_dynogp.discrepancy.search import Found
-from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
 from pyro_dynogp.discrepancy.state import SearchState
 from pyro_dynogp.discrepancy.trials import one_step_density
 from pyro_dynogp.effects.base import Effect, experiment
@@ -23,6 +22,7 @@ from pyro_dynogp.prediction.records import joined
 from pyro_dynogp.prediction.scores import scores
 from pyro_dynogp.report.report import Report
 from pyro_dynogp.statistics.evidence import Residuals
+from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.support.parallel import parallel_map
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def does_not_pay(
     after: Mapping[str, float],
     gain: float,
     error: float,
-    settings: LoopSettings = DEFAULTS,
+    settings: LoopSettings,
 ) -> list[str]:
     """A warning where forecasts of the last block are worse by both scores, or clearly less likely.
 

@@ -14,7 +14,7 @@ from unittest import mock
 import numpy as np
 
 from pyro_dynogp.discrepancy import decision
-from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
+from pyro_dynogp.statistics.settings import LoopSettings
 from tests.benchmarks.markdown import table
 from tests.benchmarks.planted import Case, study
 

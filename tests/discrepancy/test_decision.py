@@ -25,6 +25,7 @@ from pyro_dynogp.discrepancy.decision import (
 from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.discrepancy.trials import Tried, interleaved, stretches
 from pyro_dynogp.statistics.evidence import Evidence
+from tests.discrepancy.made import SETTINGS
 from tests.discrepancy.test_loop import fitted, machine
 
 MODEL = dgp.LinearDynamicGP(inputs=1, pairs=1)
@@ -44,7 +45,7 @@ def helping(effect: effects.Effect, p: float, q: float, gain: float = 50.0) -> _
     kind = ("after", effect.score)
     noise = np.random.default_rng(0).normal(0.0, 0.1, n)
     found = spoken_for(effect, p, q)
-    return _judge(found, kind, tried(noise + gain / n), tried(np.zeros(n)), 1)
+    return _judge(found, kind, tried(noise + gain / n), tried(np.zeros(n)), 1, SETTINGS)
 
 
 def names(judged: list[_Judged]) -> list[str]:
@@ -103,7 +104,9 @@ def judged_noise(gains: np.ndarray, errors: np.ndarray, before: np.ndarray) -> _
     """A candidate for the noise with gains (N,), and errors of forecasts before and after."""
     found = spoken_for(effects.HeavyTails(), 1e-9, 1e-8)
     base = tried(0.0 * gains, errors=before[:, None])
-    return _judge(found, ("after", "one step"), tried(gains, errors=errors[:, None]), base, 1)
+    return _judge(
+        found, ("after", "one step"), tried(gains, errors=errors[:, None]), base, 1, SETTINGS
+    )
 
 
 def test_noise_that_costs_the_forecasts_does_not_help() -> None:
@@ -141,7 +144,7 @@ def test_gains_of_nothing_seldom_count(freedom: float) -> None:
 
 
 def test_folds_have_data_on_either_side_of_every_instant() -> None:
-    first, second = interleaved(240)
+    first, second = interleaved(240, SETTINGS.folds)
     assert not (first & second).any()
     assert not (first | second)[:20].any()  # the past of the first forecast
     assert [part.stop - part.start for part in stretches(first)] == [20] * 6
@@ -150,7 +153,7 @@ def test_folds_have_data_on_either_side_of_every_instant() -> None:
 
 def test_half_of_the_block_that_is_searched_can_be_fitted_to() -> None:
     held_out = np.arange(480) >= 240
-    some = shared(held_out)
+    some = shared(held_out, SETTINGS.stretches)
     assert some.sum() == 120
     assert some[-1]
     assert not some[:240].any()
