@@ -215,8 +215,9 @@ def _averages(r: Residuals, best: Contrast, x: np.ndarray, fitted: np.ndarray) -
     """Averages of residual and effect in each group, the residual's own average removed."""
     rows = np.isfinite(x)
     groups, at = np.unique(best.groups[rows], return_inverse=True)
-    means = averages(at, len(groups), x[rows] - x[rows].mean(), fitted[rows])
-    return Curve(groups.astype(float), *means, f"{best.what}, {best.zone}", residual_axis(r))
+    y, effect = averages(at, len(groups), x[rows] - x[rows].mean(), fitted[rows])
+    label = f"{best.what}, {best.zone}"
+    return Curve(groups.astype(float), y, effect, label, residual_axis(r))
 
 
 class CalendarEffect(Effect):

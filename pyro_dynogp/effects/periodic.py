@@ -92,8 +92,8 @@ def _folded(r: Residuals, x: np.ndarray, effect: np.ndarray, period: float) -> C
     phase, rows = (np.arange(len(x)) * r.step) % period, np.isfinite(x)
     count = int(np.clip(period / r.step, 4, 24))
     bins = np.minimum(phase / period * count, count - 1).astype(int)[rows]
-    means = averages(bins, count, phase[rows], x[rows] - x[rows].mean(), effect[rows])
-    return Curve(*means, f"time within the period [{r.time_unit}]", residual_axis(r))
+    at, y, fitted = averages(bins, count, phase[rows], x[rows] - x[rows].mean(), effect[rows])
+    return Curve(at, y, fitted, f"time within the period [{r.time_unit}]", residual_axis(r))
 
 
 class PeriodicDisturbance(Effect):

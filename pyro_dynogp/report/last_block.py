@@ -131,8 +131,9 @@ def _tested(
 
     def smallest(task: tuple[Effect, list[Residuals]]) -> float:
         effect, parts = task
-        p = [e.p_value for one in parts for e in effect.detect(one, seed=rounds.seed)]
-        return min(p, default=1.0)  # nothing left to test
+        found = [effect.detect(part, rounds.settings, seed=rounds.seed) for part in parts]
+        # There may be nothing left to test.
+        return min((one.p_value for several in found for one in several), default=1.0)
 
     tasks = [(effect, parts) for effect in effects for parts in residuals]
     p = parallel_map(

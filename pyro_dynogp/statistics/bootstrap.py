@@ -83,7 +83,7 @@ class Noise:
         return batches(drawn, count, seed)
 
     def unbiased(
-        self, estimated: Callable[[np.ndarray], Sequence[np.ndarray]], count: int, seed: int
+        self, estimated: Callable[[np.ndarray], Iterable[np.ndarray]], count: int, seed: int
     ) -> Noise:
         """Less the bias that replicates show, as much of it as leaves the filter stable.
 

@@ -89,8 +89,8 @@ def over_time(r: Residuals, fitted: np.ndarray, blocks: int = 80) -> Curve:
     x = r.residual - np.nanmean(r.residual)
     rows = np.isfinite(x) & np.isfinite(fitted)
     block = (np.arange(len(r)) * blocks // len(r))[rows]
-    means = averages(block, blocks, r.time[rows], x[rows], fitted[rows])
-    return Curve(*means, f"time [{r.time_unit}]", residual_axis(r))
+    time, left, effect = averages(block, blocks, r.time[rows], x[rows], fitted[rows])
+    return Curve(time, left, effect, f"time [{r.time_unit}]", residual_axis(r))
 
 
 def unexplained(r: Residuals, nuisance: np.ndarray, fitted: np.ndarray) -> np.ndarray:

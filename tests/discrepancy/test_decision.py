@@ -25,6 +25,7 @@ from pyro_dynogp.discrepancy.decision import (
 from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.discrepancy.trials import Tried, interleaved, stretches
 from pyro_dynogp.statistics.evidence import Evidence
+from pyro_dynogp.statistics.settings import LoopSettings
 from tests.discrepancy.made import SETTINGS
 from tests.discrepancy.test_loop import fitted, machine
 
@@ -318,7 +319,7 @@ def test_a_calendar_moves_to_another_clock_instead_of_being_there_twice() -> Non
 
 def test_feedback_is_among_the_effects_and_changes_nothing() -> None:
     class Certain(effects.Feedback):
-        def detect(self, residuals: Any, seed: int = 0) -> list[Evidence]:
+        def detect(self, residuals: Any, settings: LoopSettings, seed: int = 0) -> list[Evidence]:
             return [spoken_for(self, 1e-9, 1e-9, channel="u").evidence]
 
     record = machine(seed=5)

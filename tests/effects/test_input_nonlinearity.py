@@ -21,4 +21,4 @@ def test_input_nonlinearity_of_one_channel(function):
     assert found.p_value < 1e-4
     assert found.where == {"channel": "v"}
     for other in (output_nonlinearity, dead_time, unmodelled_dynamics, hysteresis):
-        assert other(r).gain < found.gain
+        assert other(r, SETTINGS).gain < found.gain

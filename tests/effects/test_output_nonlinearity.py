@@ -19,6 +19,6 @@ def test_output_nonlinearity():
     assert found.p_value < 1e-6
     assert found.where == {}
     for other in (input_nonlinearity, dead_time, unmodelled_dynamics, hysteresis):
-        assert other(r).gain < found.gain
+        assert other(r, SETTINGS).gain < found.gain
     # The picture is the function.
     np.testing.assert_allclose(found.curve.fitted, found.curve.y, atol=0.1)

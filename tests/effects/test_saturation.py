@@ -43,8 +43,8 @@ def test_ties_of_a_record_of_few_digits_are_no_limit():
         rng = np.random.default_rng(seed)
         mean = lag(np.repeat(rng.choice([-1.0, 0.0, 1.0], 20), 20), 0.5)
         y = 0.05 * np.round((mean + 0.05 * coloured(rng, 400, 0.7)) / 0.05)
-        rejected += ties_at_the_top(y, mean).p_value < 0.05
+        rejected += ties_at_the_top(y, mean, SETTINGS).p_value < 0.05
         clipped = np.minimum(y, 0.6)
         if (y > 0.6).sum() > 40:
-            assert ties_at_the_top(clipped, mean).p_value < 0.01
+            assert ties_at_the_top(clipped, mean, SETTINGS).p_value < 0.01
     assert rejected <= 6

@@ -92,4 +92,4 @@ def test_the_model_without_process_noise_shows_what_it_took_up():
     r = residuals(3, 400)
     plain = residuals(3, 400, effect=lambda t, mean, u: share(u[:, 0] * np.roll(u[:, 0], 6), 0.3))
     assert structure_left(r, SETTINGS, 0.05)[0] > 0.05
-    assert structure_left(r, SETTINGS, 0.05, plain)[0] < 0.01
+    assert structure_left(r, SETTINGS, 0.05, plain=plain)[0] < 0.01
