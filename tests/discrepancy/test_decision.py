@@ -221,7 +221,7 @@ def test_the_fit_of_the_winner_is_handed_on() -> None:
     variants = tuple(found.effect.extend(model, found.evidence, record))
     done = confirm(
         [(found, variants)], fit, record[:360], held_out,
-        number=1, seed=0, level=0.05, workers=1,
+        number=1, seed=0, level=0.05, settings=SETTINGS, workers=1,
     )  # fmt: skip
     assert done.winner is found
     assert done.fit is not None
@@ -241,7 +241,17 @@ def test_noise_is_tried_where_no_structure_is_certain(q: float, decision: str) -
     model = replace(fit.model, scaling=None)
     tasks = [(one, tuple(one.effect.extend(model, one.evidence, record))) for one in both]
     held_out = np.arange(360) >= 240
-    done = confirm(tasks, fit, record[:360], held_out, number=1, seed=0, level=0.05, workers=1)
+    done = confirm(
+        tasks,
+        fit,
+        record[:360],
+        held_out,
+        number=1,
+        seed=0,
+        level=0.05,
+        settings=SETTINGS,
+        workers=1,
+    )
     assert done.winner is both[1]
     decisions = {one.evidence.effect: one.decision for one in done.attempts}
     assert decisions == {"extra input": "accepted", "heavy tails": decision}
