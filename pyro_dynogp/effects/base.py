@@ -86,8 +86,13 @@ class Effect:
     ) -> Sequence[Evidence]:
         """Evidence for the effect, one for each channel it may come from; may be empty.
 
+        Args:
+            residuals: of one output (n,). settings: thresholds, those of the loop.
+            seed: of what is simulated under the null.
+
         Raises:
-            ValueError: where the residuals cannot be tested for it.
+            ValueError: where the residuals cannot be tested for it, as where too few samples are
+                measured (those held out, for effects that are looked for there).
         """
         return listed(self.test(residuals, settings, seed=seed))
 

@@ -18,7 +18,7 @@ from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
 from pyro_dynogp.statistics.pictures import about, averages, evidence, residual_axis
 from pyro_dynogp.statistics.prewhitening import free_columns, prewhitened, spanning
 from pyro_dynogp.statistics.settings import LoopSettings
-from pyro_dynogp.statistics.shares_of_inputs import own
+from pyro_dynogp.statistics.shares_of_inputs import input_columns
 from pyro_dynogp.support.errors import invalid
 
 WEEKDAYS = ("Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun")
@@ -112,7 +112,7 @@ def _best_of(
     degrees = [c.degrees for c in contrasts]
     scan = prewhitened(
         x,
-        free_columns(columns, places, spanning(own(r)), missing, settings, degrees),
+        free_columns(columns, places, spanning(input_columns(r)), missing, settings, degrees),
         r.deviations,
         settings,
         first=columns[:, lines] if len(lines) < (~missing).sum() // 5 else None,

@@ -39,9 +39,6 @@ def dead_time(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) ->
     all of it with one input, the share by `paths` with several. The delay is that at which the
     column fits with a weight of one. `where`: channel, delay (additional, > 0 for later)
     [time unit].
-
-    Raises:
-        ValueError: where too few samples are held out and measured.
     """
     r = residuals
     names, shares = r.input_names, paths(r).shares

@@ -10,14 +10,13 @@ import numpy as np
 from pyro_dynogp.data.channels import DeadZone
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.effects.base import AROUND, FINER, Effect, changed, number_of
-from pyro_dynogp.effects.linear_responses import linear_responses
 from pyro_dynogp.models.variants import Model, with_channel
 from pyro_dynogp.statistics.detecting import Search, lasting, one_sided
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
 from pyro_dynogp.statistics.pictures import about, binned, evidence, residual_axis, unexplained
 from pyro_dynogp.statistics.regression import with_past
 from pyro_dynogp.statistics.settings import LoopSettings
-from pyro_dynogp.statistics.shares_of_inputs import paths
+from pyro_dynogp.statistics.shares_of_inputs import linear_responses, paths
 
 # Quantiles of an input between which a dead zone may lie.
 LEVELS = np.linspace(0.0, 1.0, 9)

@@ -29,15 +29,9 @@ def drift(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> Evi
     The level changes by cosines of k half periods over the record, k = 1 to 4; a gain by the same
     cosines times the mean's deviation from its average, or times the share of one input.
 
-    Args:
-        residuals: of one output (n,). settings: thresholds. seed: of the replicates.
-
     Returns:
         where: form "additive" or "gain", channel (input or output whose gain drifts, "" for the
         level), time_scale (half a period of what dominates) [time unit].
-
-    Raises:
-        ValueError: where too few samples are measured.
 
     Source: slow cosines as in Müller & Watson, Econometrica 76(5):979 (2008); the null by
     `prewhitened`.

@@ -32,9 +32,6 @@ def unmodelled_dynamics(residuals: Residuals, settings: LoopSettings, *, seed: i
     time_constant [time unit] of the resonance where that is the best variant (its time constant of
     decay); else the frequency of the largest coherence between the residual and the input that
     explains most, and the time constant of the first-order response of it that does.
-
-    Raises:
-        ValueError: where too few samples are held out and measured.
     """
     check_inputs(residuals)
     r = regained(residuals, settings)

@@ -25,7 +25,7 @@ from pyro_dynogp.statistics.pictures import (
 )
 from pyro_dynogp.statistics.responses import responses, standardised
 from pyro_dynogp.statistics.settings import LoopSettings
-from pyro_dynogp.statistics.shares_of_inputs import own
+from pyro_dynogp.statistics.shares_of_inputs import input_columns
 
 
 def extra_input(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> list[Evidence]:
@@ -37,13 +37,10 @@ def extra_input(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) 
 
     Returns:
         One piece of evidence for each candidate.
-
-    Raises:
-        ValueError: where too few samples are held out and measured.
     """
     if not residuals.candidates:
         return []
-    nuisance = own(residuals)
+    nuisance = input_columns(residuals)
     return [_extra(residuals, name, nuisance, settings, seed) for name in residuals.candidates]
 
 

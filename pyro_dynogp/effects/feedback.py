@@ -16,7 +16,7 @@ from pyro_dynogp.statistics.detecting import looked
 from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
 from pyro_dynogp.statistics.prewhitening import Projection, log_ratio, spanning
 from pyro_dynogp.statistics.settings import LoopSettings
-from pyro_dynogp.statistics.shares_of_inputs import own
+from pyro_dynogp.statistics.shares_of_inputs import input_columns
 
 # Of future inputs: a controller answers within as many samples.
 AHEAD = (1, 2, 4, 8, 16)
@@ -30,15 +30,9 @@ def feedback(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> 
     they share at the same instant may be a direct path and does not count: a controller that
     answers within the sample is seen only as far as it goes on answering.
 
-    Args:
-        residuals: of one output (n,). settings: thresholds. seed: of the replicates.
-
     Returns:
         One for each input that varies. where: channel. size: part of the one-step error that the
         input repeats [output]. gain is of the input's future in the residual [nats].
-
-    Raises:
-        ValueError: where too few held-out samples are measured.
 
     Source: cross-correlation at negative lags (Ljung, System Identification, 2nd ed., 16.6), both
     sides whitened (Haugh, JASA 71(354):378, 1976); largest over windows, null by resampling.
@@ -59,7 +53,7 @@ def _followed(
     surprise[foretell.order :] = foretell(u - u.mean())
     future = np.column_stack([np.append(surprise[k:], np.full(k, np.nan)) for k in range(1, K + 1)])
     missing = ~(np.isfinite(x) & np.isfinite(future).all(1))
-    under = Projection(whiten, spanning(own(r)), missing, settings)
+    under = Projection(whiten, spanning(input_columns(r)), missing, settings)
     white, e = under.filtered(x), under(x)
     F = future[whiten.order :][under.rows]
     size = np.sqrt(np.square(F).sum(0))

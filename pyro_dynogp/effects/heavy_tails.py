@@ -28,17 +28,11 @@ def heavy_tails(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) 
     The statistic is their excess kurtosis, whitened once more, over its standard deviation under
     normal noise: locally the most powerful one against Student-t noise. Its null is simulated.
 
-    Args:
-        residuals: of one output (n,). settings: thresholds. seed: of the simulated null.
-
     Returns:
         where: degrees_of_freedom of the Student-t distribution of largest likelihood, outliers:
         count beyond what the largest of as many normal ones exceeds once in twenty records. gain
         is that of the Student-t over the normal distribution; size is the outliers' part of the
         one-step error [output].
-
-    Raises:
-        ValueError: where too few held-out samples are measured.
 
     Source: kurtosis test as in D'Agostino & Pearson, Biometrika 60(3):613 (1973), by simulation.
     """
@@ -109,10 +103,10 @@ def student_t(w: np.ndarray) -> tuple[float, float, float, float]:
         return float(stats.t.logpdf(w, nu, at, scale).sum())
 
     bounds = (np.log(LOWEST), np.log(HIGHEST))
-    found = minimize_scalar(lambda x: -log_density(x), bounds=bounds, method="bounded")
-    nu = float(np.exp(found.x))
+    optimum = minimize_scalar(lambda x: -log_density(x), bounds=bounds, method="bounded")
+    nu = float(np.exp(optimum.x))
     normal = float(stats.norm.logpdf(w, w.mean(), w.std()).sum())
-    return nu, *located(nu), max(-float(found.fun) - normal, 0.0)
+    return nu, *located(nu), max(-float(optimum.fun) - normal, 0.0)
 
 
 class HeavyTails(Effect):

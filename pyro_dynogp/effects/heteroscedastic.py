@@ -11,8 +11,8 @@ from pyro_dynogp.data.signals import held
 from pyro_dynogp.effects.base import Effect
 from pyro_dynogp.layers.noise import Driver, Heteroscedastic
 from pyro_dynogp.models.variants import Model, with_likelihood
-from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
-from pyro_dynogp.statistics.pictures import evidence
+from pyro_dynogp.statistics.evidence import Evidence, Residuals
+from pyro_dynogp.statistics.pictures import binned, evidence, labelled
 from pyro_dynogp.statistics.prewhitening import free_columns, prewhitened, spanning
 from pyro_dynogp.statistics.responses import filtered
 from pyro_dynogp.statistics.serial import held_out_innovations, one_step_sd
@@ -33,15 +33,9 @@ def heteroscedastic_noise(
     logarithm of the square 40 %, and outliers do not carry it. Sizes that only cluster in time, as
     in autoregressive conditional heteroscedasticity, are the colour of the size, and no driver.
 
-    Args:
-        residuals: of one output (n,). settings: thresholds. seed: of the replicates.
-
     Returns:
         where: driver (an input's name, "mean" or "time"). size: standard deviation over the record
         of the one-step error's standard deviation [output].
-
-    Raises:
-        ValueError: where too few held-out samples are measured.
 
     Source: Glejser, JASA 64(325):316 (1969); efficiencies: Davidian & Carroll, JASA 82(400):1079
     (1987). The null: `prewhitened`.
@@ -80,7 +74,10 @@ def heteroscedastic_noise(
     low, high = np.quantile(level[np.isfinite(y)], [0.05, 0.95])
     unit = one_step_sd(r, settings) / average
     shown = r.time if name == "time" else variants[scan.best][:, 0]
-    label = name if name == "time" else f"{name}, as it acts"
+    axes = (
+        name if name == "time" else f"{name}, as it acts",
+        labelled(f"standard deviation of the noise of {r.output_name}", r.output_unit),
+    )
     what = "the mean" if name == "mean" else name if name == "time" else repr(name)
     return evidence(
         "heteroscedastic noise",
@@ -88,24 +85,8 @@ def heteroscedastic_noise(
         {"driver": name},
         f"The noise of {r.output_name!r} depends on {what}: its standard deviation varies "
         f"by a factor of {high / low:.2g} (5 to 95 % of the samples).",
-        _by_level(shown, unit * y, unit * level, label, r),
+        binned(r, shown, unit * y, unit * level, axes, bins=20),
         unit * scan.size,
-    )
-
-
-def _by_level(
-    x: np.ndarray, y: np.ndarray, fitted: np.ndarray, label: str, r: Residuals, bins: int = 20
-) -> Curve:
-    """Size of the noise, averaged in bins of equal count of what drives it."""
-    known = np.flatnonzero(np.isfinite(y))
-    parts = np.array_split(known[np.argsort(x[known], kind="stable")], bins)
-    parts = [p for p in parts if len(p)]
-    return Curve(
-        x=np.array([x[p].mean() for p in parts]),
-        y=np.array([y[p].mean() for p in parts]),
-        fitted=np.array([fitted[p].mean() for p in parts]),
-        x_label=label,
-        y_label=f"standard deviation of the noise of {r.output_name} [{r.output_unit}]",
     )
 
 

@@ -10,14 +10,13 @@ from pyro_dynogp.data.channels import Play
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.signals import play
 from pyro_dynogp.effects.base import AROUND, Effect, finer, number_of
-from pyro_dynogp.effects.linear_responses import linear_responses
 from pyro_dynogp.models.variants import Model, with_channel
 from pyro_dynogp.statistics.detecting import Search, lasting, one_sided
 from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
 from pyro_dynogp.statistics.pictures import about, evidence, labelled, unit
 from pyro_dynogp.statistics.regression import with_past
 from pyro_dynogp.statistics.settings import LoopSettings
-from pyro_dynogp.statistics.shares_of_inputs import paths
+from pyro_dynogp.statistics.shares_of_inputs import linear_responses, paths
 
 # Widths of play that are tried, against the range of the signal.
 WIDTHS = np.geomspace(0.02, 0.8, 10)
@@ -30,9 +29,6 @@ def hysteresis(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -
     A phase lag, which differs from play in that it depends on frequency, is left to the responses
     of the inputs. `where`: channel (the output's name for play there), width (full, of that
     channel's unit).
-
-    Raises:
-        ValueError: where too few samples are held out and measured.
     """
     r = residuals
     path = paths(r)

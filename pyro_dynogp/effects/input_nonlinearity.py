@@ -9,7 +9,6 @@ import numpy as np
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.signals import hermite, hinges
 from pyro_dynogp.effects.base import Effect
-from pyro_dynogp.effects.linear_responses import linear_responses
 from pyro_dynogp.models.variants import Model, with_input_function
 from pyro_dynogp.statistics.detecting import lasting
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
@@ -17,7 +16,7 @@ from pyro_dynogp.statistics.pictures import about, binned, evidence, residual_ax
 from pyro_dynogp.statistics.regression import with_past
 from pyro_dynogp.statistics.responses import responses
 from pyro_dynogp.statistics.settings import LoopSettings
-from pyro_dynogp.statistics.shares_of_inputs import paths
+from pyro_dynogp.statistics.shares_of_inputs import linear_responses, paths
 
 
 def input_nonlinearity(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> Evidence:
@@ -26,9 +25,6 @@ def input_nonlinearity(residuals: Residuals, settings: LoopSettings, *, seed: in
     The functions (Hermite polynomials, piecewise linear ones) go through the model's own path from
     that input, and the polynomials through a bank of filters as well (after the cross-correlations
     with squared inputs of Billings and Voon, Int. J. Control 44:235, 1986). `where`: channel.
-
-    Raises:
-        ValueError: where too few samples are held out and measured.
     """
     r = residuals
     path = paths(r)

@@ -31,14 +31,8 @@ LEVELS = 8
 def level_shift(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> Evidence:
     """A step of the output's level at any instant, looked for in the whole record.
 
-    Args:
-        residuals: of one output (n,). settings: thresholds. seed: of the replicates.
-
     Returns:
         where: time (of the first sample at the new level) [time unit], size [output].
-
-    Raises:
-        ValueError: where too few samples are measured.
 
     Source: largest F statistic over the instant, Andrews, Econometrica 61(4):821 (1993), in the
     whitened residual, as level shifts in Chen & Liu, JASA 88(421):284 (1993).

@@ -29,9 +29,6 @@ def output_nonlinearity(residuals: Residuals, settings: LoopSettings, *, seed: i
     Variants: Hermite polynomials of the second and third degree, apart and together, and piecewise
     linear functions with one knot and with five (after Ramsey's RESET, J. R. Stat. Soc. B 31:350,
     1969). `where` is empty.
-
-    Raises:
-        ValueError: where too few samples are held out and measured.
     """
     r = residuals
     powers, bends = hermite(r.mean), hinges(r.mean)

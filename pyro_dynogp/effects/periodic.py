@@ -17,7 +17,7 @@ from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
 from pyro_dynogp.statistics.pictures import about, averages, evidence, residual_axis
 from pyro_dynogp.statistics.prewhitening import prewhitened, spanning
 from pyro_dynogp.statistics.settings import LoopSettings
-from pyro_dynogp.statistics.shares_of_inputs import own
+from pyro_dynogp.statistics.shares_of_inputs import input_columns
 
 # Grid of frequencies: so many for each 1 / duration.
 OVERSAMPLING = 4
@@ -60,7 +60,7 @@ def periodic_disturbance(
     span = int(looked[-1] - looked[0]) + 1
     # Only what is looked at counts, so that the grid is no finer than it need be.
     x, kept = x[looked[0] : looked[-1] + 1], (at >= looked[0]) & (at <= looked[-1])
-    beside = own(r)[kept]
+    beside = input_columns(r)[kept]
     nuisance = np.zeros((span, beside.shape[1]))
     nuisance[at[kept] - looked[0]] = beside
     nuisance = spanning(nuisance)

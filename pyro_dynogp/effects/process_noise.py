@@ -20,15 +20,9 @@ def process_noise(residuals: Residuals, settings: LoopSettings, *, seed: int = 0
 
     Their null keeps their sizes in place, so that heteroscedastic noise does not look coloured.
 
-    Args:
-        residuals: of one output (n,). settings: thresholds. seed: of the random signs.
-
     Returns:
         where: time_constant of an autocorrelation c exp(-lag / time_constant) [time unit], zero
         where neighbours differ in sign. size: what the past tells of the one-step error [output].
-
-    Raises:
-        ValueError: where too few held-out samples are measured.
 
     Source: `portmanteau`.
     """

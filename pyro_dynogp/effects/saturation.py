@@ -37,9 +37,6 @@ def saturation(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -
     `ties_at_the_top`), and an output that flattens where the mean goes on: to less than a share
     `flat` of its slope, or it is another nonlinearity. `where`: low, high [output], infinite where
     there is none.
-
-    Raises:
-        ValueError: where too few samples are held out and measured.
     """
     r = residuals
     top = ties_at_the_top(r.output, r.mean, settings, seed=seed)
@@ -149,9 +146,6 @@ def ties_at_the_top(
     Args:
         output: (n,) measured, NaN where missing [output]. mean: (n,) [output].
         settings: thresholds. seed: of the replicates.
-
-    Raises:
-        ValueError: where too few samples are measured.
     """
     measured = np.isfinite(output) & np.isfinite(mean)
     y = output[measured]

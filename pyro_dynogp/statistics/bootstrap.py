@@ -92,10 +92,10 @@ class Noise:
             count: of replicates, of which half are enough. seed: of them.
         """
         plain = replace(self, deviations=self.deviations[:0])
-        found = [a for batch in plain.replicates((count + 1) // 2, seed) for a in estimated(batch)]
-        p = max(len(self.coefficients), *map(len, found))
+        again = [a for batch in plain.replicates((count + 1) // 2, seed) for a in estimated(batch)]
+        p = max(len(self.coefficients), *map(len, again))
         a = _padded(self.coefficients, p)
-        bias = np.mean([_padded(other, p) for other in found], axis=0) - a
+        bias = np.mean([_padded(other, p) for other in again], axis=0) - a
         for share in np.linspace(1.0, 0.0, 21):
             if radius(a - share * bias) <= SLOWEST:
                 return replace(self, coefficients=a - share * bias)

@@ -8,10 +8,9 @@ from functools import partial
 
 import numpy as np
 
-from pyro_dynogp.statistics.autoregression import Whitener
 from pyro_dynogp.statistics.bootstrap import Scan
 from pyro_dynogp.statistics.evidence import Residuals
-from pyro_dynogp.statistics.regression import gains_under, noise_filter, regress, solve, with_past
+from pyro_dynogp.statistics.regression import basis, noise_filter, regress, solve, with_past
 from pyro_dynogp.statistics.settings import LoopSettings
 
 
@@ -80,10 +79,26 @@ class Search:
     weight: float | None = None
 
     def gains(self, variants: Sequence[np.ndarray], beside: np.ndarray) -> np.ndarray:
-        """Of variants [nats], (J,), under the filter as estimated beside one of them."""
-        return gains_under(
-            self._filter(beside), looked(self.residuals), variants, self.nuisance, self.weight
-        )
+        """Of variants (n,) or (n, K) [nats], (J,), under the filter as estimated beside one.
+
+        With a filter for each, as in `regress`, the residual's own past would do much of what the
+        variant should: it makes any resonance.
+        """
+        x = looked(self.residuals)
+        whiten = noise_filter(x, np.column_stack([self.nuisance, with_past(beside)]), self.settings)
+        rest = whiten(x)
+        rows = np.isfinite(rest)
+        Q = basis(whiten(np.column_stack([np.ones(len(x)), self.nuisance]))[rows])
+
+        def free(w: np.ndarray) -> np.ndarray:
+            return w[rows] - Q @ (Q.T @ w[rows])
+
+        e, gains = free(rest), []
+        for v in variants:
+            w = free(whiten(v[:, None] if v.ndim == 1 else v))
+            weights = solve(w, e) if self.weight is None else np.full(w.shape[1], self.weight)
+            gains.append(0.5 * len(e) * np.log((e @ e) / np.square(e - w @ weights).sum()))
+        return np.array(gains)
 
     def located(
         self, columns: Callable[[float], np.ndarray], start: float, grid: np.ndarray
@@ -93,13 +108,11 @@ class Search:
         Twice: under the noise's filter as estimated beside the columns at the start, then at the
         first result.
         """
-        e = looked(self.residuals)
         for _ in range(2):
-            whiten = self._filter(columns(start))
+            beside = columns(start)
 
-            def gain(at: np.ndarray, whiten: Whitener = whiten) -> np.ndarray:
-                tried = [columns(float(x)) for x in at]
-                return gains_under(whiten, e, tried, self.nuisance, self.weight)
+            def gain(at: np.ndarray, beside: np.ndarray = beside) -> np.ndarray:
+                return self.gains([columns(float(x)) for x in at], beside)
 
             start = finest(gain, grid)
         return start
@@ -119,10 +132,6 @@ class Search:
             if np.isfinite(high):
                 high = self.located(partial(column, low), high, grid[grid > low])
         return low, high
-
-    def _filter(self, beside: np.ndarray) -> Whitener:
-        columns = np.column_stack([self.nuisance, with_past(beside)])
-        return noise_filter(looked(self.residuals), columns, self.settings)
 
 
 def finest(gain: Callable[[np.ndarray], np.ndarray], grid: np.ndarray, times: int = 2) -> float:

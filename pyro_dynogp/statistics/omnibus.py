@@ -17,7 +17,7 @@ from pyro_dynogp.statistics.prewhitening import free_columns, prewhitened, spann
 from pyro_dynogp.statistics.responses import responses, standardised
 from pyro_dynogp.statistics.serial import held_out_innovations, portmanteau
 from pyro_dynogp.statistics.settings import LoopSettings
-from pyro_dynogp.statistics.shares_of_inputs import looked_at, own
+from pyro_dynogp.statistics.shares_of_inputs import input_columns, looked_at
 
 
 def structure_left(
@@ -102,7 +102,7 @@ def _follows(r: Residuals, settings: LoopSettings, seed: int) -> float:
     """Probability of as much that inputs, candidates, their powers or time explain."""
     each = looked_at(r) // (16 * max(len(r.input_names) + len(r.candidates), 1))
     constants = int(np.clip(each, 1, 4))
-    blocks = [own(r), _slow(r)]
+    blocks = [input_columns(r), _slow(r)]
     for signal in [r.mean, *r.inputs.T, *r.candidates.values()]:
         u = held(signal)
         if np.std(u) > 0:

@@ -101,9 +101,9 @@ def prewhitened(
 
 def _without(x: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """What least squares leave of a series (n,) beside columns and a constant."""
-    there = np.isfinite(x)
+    measured = np.isfinite(x)
     Q = spanning(columns)
-    return x - Q @ np.linalg.lstsq(Q[there], x[there], rcond=1e-9)[0]
+    return x - Q @ np.linalg.lstsq(Q[measured], x[measured], rcond=1e-9)[0]
 
 
 def spanning(columns: np.ndarray) -> np.ndarray:

@@ -46,26 +46,26 @@ def regress(
         settings: thresholds. seed: of the replicates.
 
     Raises:
-        ValueError: where there are no variants, or too few samples beyond what the nuisance and the
+        ValueError: where whole are no variants, or too few samples beyond what the nuisance and the
             past take.
     """
     if not len(variants):
         raise invalid("variants", expected="at least one", got="none")
     n = len(residual)
     series = _lags(residual, max(fitted_filter(residual, settings).order, 1))
-    there, p = np.isfinite(series).all(0), len(series) - 1
+    whole, p = np.isfinite(series).all(0), len(series) - 1
     N = np.ones((n, 1)) if nuisance is None else np.column_stack([np.ones(n), nuisance])
-    m = int(there.sum())
-    Z = _basis(N[there]) if m else N[there]
+    m = int(whole.sum())
+    Z = basis(N[whole]) if m else N[whole]
     samples = m - Z.shape[1] - p
     check_samples(samples, settings, "samples beyond nuisance and past")
-    bases = [_basis((x := v[there]) - Z @ (Z.T @ x), against=x) for v in variants]
+    bases = [basis((x := v[whole]) - Z @ (Z.T @ x), against=x) for v in variants]
     X = np.column_stack(bases)
     K = np.array([max(b.shape[1], 1) for b in bases], dtype=float)
     ends = np.cumsum([b.shape[1] for b in bases])
-    free = series[:, there] - (series[:, there] @ Z) @ Z.T
+    free = series[:, whole] - (series[:, whole] @ Z) @ Z.T
     gains = _ratios((free @ free.T)[None], (free @ X)[None], ends, samples)[0]
-    rows = np.flatnonzero(there) - np.arange(p + 1)[:, None]
+    rows = np.flatnonzero(whole) - np.arange(p + 1)[:, None]
 
     def products(lags: np.ndarray) -> np.ndarray:
         """Of series and their past (R, p + 1, m), less the nuisance."""
@@ -79,9 +79,9 @@ def regress(
     def gains_of(batch: np.ndarray) -> np.ndarray:  # X has nothing of the nuisance
         return _ratios(products(lags := batch[:, rows]), lags @ X, ends, samples)
 
-    design = np.concatenate([series[1:].T, N], axis=1)[there]
-    weights = solve(design, residual[there])
-    e, a = residual[there] - design @ weights, weights[:p]
+    design = np.concatenate([series[1:].T, N], axis=1)[whole]
+    weights = solve(design, residual[whole])
+    e, a = residual[whole] - design @ weights, weights[:p]
     # Least squares may leave a pole outside the circle or next to it.
     a = a * min(1.0, SLOWEST / max(radius(a), 1e-300)) ** np.arange(1, p + 1)
     noise = noise_of(a, e, design.shape[1], ~np.isfinite(residual), deviations)
@@ -90,51 +90,20 @@ def regress(
 
     def fit(best: int) -> tuple[np.ndarray, Whitener]:
         both = np.column_stack([variants[best], N])
-        whiten = _colour(series, both, there)
-        kept = there[whiten.order :]
+        whiten = _colour(series, both, whole)
+        kept = whole[whiten.order :]
         weights = solve(whiten(both)[kept], whiten(residual)[kept])
         fitted = variants[best] @ weights[: variants[best].shape[1]]
-        return fitted - fitted[there].mean(), whiten
+        return fitted - fitted[whole].mean(), whiten
 
-    return scanned(gains, K, null, fit, there, settings)
+    return scanned(gains, K, null, fit, whole, settings)
 
 
 def noise_filter(residual: np.ndarray, columns: np.ndarray, settings: LoopSettings) -> Whitener:
     """Filter of the noise: a residual's own past (n,), NaN where missing, beside columns (n, M)."""
     series = _lags(residual, max(fitted_filter(residual, settings).order, 1))
-    there = np.isfinite(series).all(0)
-    return _colour(series, np.column_stack([np.ones(len(residual)), columns]), there)
-
-
-def gains_under(
-    whiten: Whitener,
-    residual: np.ndarray,
-    variants: Sequence[np.ndarray],
-    nuisance: np.ndarray,
-    weight: float | None = None,
-) -> np.ndarray:
-    """Gains [nats] of variants, (J,), under one filter of the noise: to find where an effect is.
-
-    With a filter for each, as in `regress`, the residual's own past would do much of what the
-    variant should: it makes any resonance.
-
-    Args:
-        whiten: of the noise. residual: (n,), NaN where missing or not looked at.
-        variants: each (n,) or (n, K), finite. nuisance: (n, M).
-        weight: of the columns; by default the best.
-    """
-    N = whiten(np.column_stack([np.ones(len(residual)), nuisance]))
-    e = whiten(residual)
-    rows = np.isfinite(e)
-    Q = _basis(N[rows])
-    e = e[rows] - Q @ (Q.T @ e[rows])
-    gains = []
-    for v in variants:
-        w = whiten(v[:, None] if v.ndim == 1 else v)[rows]
-        w = w - Q @ (Q.T @ w)
-        fit = w @ (solve(w, e) if weight is None else np.full(w.shape[1], weight))
-        gains.append(0.5 * len(e) * np.log((e @ e) / np.square(e - fit).sum()))
-    return np.array(gains)
+    whole = np.isfinite(series).all(0)
+    return _colour(series, np.column_stack([np.ones(len(residual)), columns]), whole)
 
 
 def _lags(x: np.ndarray, p: int) -> np.ndarray:
@@ -170,10 +139,10 @@ def _ratios(products: np.ndarray, cross: np.ndarray, ends: np.ndarray, samples: 
     return -samples * np.log1p(-np.clip(share, 0.0, 1.0 - 1e-12))
 
 
-def _colour(series: np.ndarray, columns: np.ndarray, there: np.ndarray) -> Whitener:
+def _colour(series: np.ndarray, columns: np.ndarray, whole: np.ndarray) -> Whitener:
     """The residual's own past beside columns."""
-    design = np.concatenate([series[1:].T, columns], axis=1)[there]
-    return Whitener(solve(design, series[0, there])[: len(series) - 1])
+    design = np.concatenate([series[1:].T, columns], axis=1)[whole]
+    return Whitener(solve(design, series[0, whole])[: len(series) - 1])
 
 
 def solve(columns: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -183,7 +152,7 @@ def solve(columns: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.linalg.lstsq(columns / size, y, rcond=1e-8)[0] / size
 
 
-def _basis(columns: np.ndarray, against: np.ndarray | None = None) -> np.ndarray:
+def basis(columns: np.ndarray, against: np.ndarray | None = None) -> np.ndarray:
     """Orthonormal columns of the same span, without those that are next to nothing.
 
     Sizes are about the mean, which a constant explains, so that offsets do not matter.

@@ -38,11 +38,11 @@ def autocorrelation(x: np.ndarray, lags: int) -> tuple[np.ndarray, np.ndarray]:
 
     The mean is removed; pairs (lags,) is the number of pairs that both are there.
     """
-    there = np.isfinite(x[0])
-    y = np.where(there, x - np.nanmean(x, axis=1, keepdims=True), 0.0)
+    measured = np.isfinite(x[0])
+    y = np.where(measured, x - np.nanmean(x, axis=1, keepdims=True), 0.0)
     length = next_fast_len(x.shape[1] + lags, real=True)
     products = irfft(np.abs(rfft(y, length)) ** 2, length)[:, : lags + 1]
-    pairs = np.round(irfft(np.abs(rfft(there.astype(float), length)) ** 2, length))[: lags + 1]
+    pairs = np.round(irfft(np.abs(rfft(measured.astype(float), length)) ** 2, length))[: lags + 1]
     variance = np.maximum(products[:, :1] / pairs[0], 1e-300)
     return (products[:, 1:] / np.maximum(pairs[1:], 1.0)) / variance, pairs[1:]
 
