@@ -108,14 +108,14 @@ def _best_of(
         lines: those that are taken out of the noise's filter.
     """
     x = r.residual
-    missing, places = ~np.isfinite(x), [np.array(c.columns) for c in contrasts]
-    degrees = [c.degrees for c in contrasts]
+    places = [np.array(c.columns) for c in contrasts]
     scan = prewhitened(
         x,
-        free_columns(columns, places, spanning(input_columns(r)), missing, settings, degrees),
+        free_columns(columns, places, [c.degrees for c in contrasts]),
+        spanning(input_columns(r)),
         r.deviations,
         settings,
-        first=columns[:, lines] if len(lines) < (~missing).sum() // 5 else None,
+        first=columns[:, lines] if len(lines) < np.isfinite(x).sum() // 5 else None,
         seed=seed,
     )
     # The record's own clock, where others tell no better.

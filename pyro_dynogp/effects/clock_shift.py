@@ -71,8 +71,8 @@ def clock_shift(
     # A shift of the whole record is a dead time, and a wrong gain is not a matter of clocks.
     everywhere = [shifted(s, r.time, k * r.step) for s in shares.T for k in WHOLE]
     nuisance = spanning(np.column_stack([r.mean, *everywhere]))
-    variants = score_of_shifts(tried, nuisance, ~np.isfinite(r.residual), settings)
-    scan = prewhitened(r.residual, variants, r.deviations, settings, seed=seed)
+    variants = score_of_shifts(tried)
+    scan = prewhitened(r.residual, variants, nuisance, r.deviations, settings, seed=seed)
     J = tried.changes.shape[1]
     best = _preferred(scan.gains, scan.best, rules, J, settings.preference)
     place, j = divmod(best, J)

@@ -75,18 +75,15 @@ def shifts_of(
     )
 
 
-def score_of_shifts(
-    tried: Shifts, nuisance: np.ndarray, missing: np.ndarray, settings: LoopSettings
-) -> Variants:
+def score_of_shifts(tried: Shifts) -> Variants:
     """All shifts from all edges, by sums over what lies between two edges.
 
     At an edge the whitened effect differs from the part of the whitened change for as many samples
     as the filter has coefficients; that is left out.
     """
 
-    def prepare(whiten: Whitener) -> Score:
-        under = Projection(whiten, nuisance, missing, settings)
-        rows = np.flatnonzero(under.rows) + whiten.order
+    def prepare(under: Projection) -> Score:
+        rows = np.flatnonzero(under.rows) + under.whiten.order
         w = under.filtered(tried.changes)
         starts = np.searchsorted(rows, tried.edges)
         masks = tried.parts[:, rows]
@@ -117,7 +114,7 @@ def score_of_shifts(
 
     J = tried.changes.shape[1]
     count = J * (len(tried.parts) + len(tried.edges))
-    return Variants(prepare, np.ones(count), 2 * nuisance.shape[1] + J)
+    return Variants(prepare, np.ones(count), J)
 
 
 def refined_shift(

@@ -52,10 +52,15 @@ def drift(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> Evi
     K = slow.shape[1]
     columns = np.concatenate([slow * s[:, None] for s in scaled], axis=1)
     places = [np.array(k) - 1 + K * j for j in range(len(scaled)) for k in SLOW]
-    missing = ~np.isfinite(r.residual)
-    variants = free_columns(columns, places, spanning(nuisance), missing, settings)
-    first = np.column_stack([columns, nuisance])
-    scan = prewhitened(r.residual, variants, r.deviations, settings, first=first, seed=seed)
+    scan = prewhitened(
+        r.residual,
+        free_columns(columns, places),
+        spanning(nuisance),
+        r.deviations,
+        settings,
+        first=np.column_stack([columns, nuisance]),
+        seed=seed,
+    )
     j, order = divmod(scan.best, len(SLOW))
     # What the fitted effect is as a function of time alone, and the cosine that dominates there.
     basis = slow[:, [k - 1 for k in SLOW[order]]] * scaled[j][:, None]

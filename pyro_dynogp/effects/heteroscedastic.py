@@ -62,7 +62,8 @@ def heteroscedastic_noise(
     places = [np.arange(b - v.shape[1], b) for v, b in zip(variants, ends, strict=True)]
     scan = prewhitened(
         y,
-        free_columns(columns, places, spanning(columns[:, :0]), ~np.isfinite(y), settings),
+        free_columns(columns, places),
+        spanning(columns[:, :0]),
         r.deviations[:0],
         settings,
         first=columns if columns.shape[1] < np.isfinite(y).sum() // 5 else cosines,

@@ -10,7 +10,6 @@ from pyro_dynogp.data.channels import Step
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.effects.base import Effect, number_of
 from pyro_dynogp.models.variants import Model, with_channel
-from pyro_dynogp.statistics.autoregression import Whitener
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
 from pyro_dynogp.statistics.pictures import evidence, instant, over_time
 from pyro_dynogp.statistics.prewhitening import (
@@ -46,7 +45,8 @@ def level_shift(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) 
     stairs = np.eye(LEVELS)[np.arange(len(r)) * LEVELS // len(r)]
     scan = prewhitened(
         x,
-        _steps(places, nuisance, ~np.isfinite(x), settings),
+        _steps(places),
+        nuisance,
         r.deviations,
         settings,
         first=np.column_stack([stairs, nuisance]),
@@ -65,19 +65,16 @@ def level_shift(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) 
     )
 
 
-def _steps(
-    places: np.ndarray, nuisance: np.ndarray, missing: np.ndarray, settings: LoopSettings
-) -> Variants:
+def _steps(places: np.ndarray) -> Variants:
     r"""Steps at all places.
 
     A step is a sum of pulses. The filter makes of a pulse its coefficients c = (1, -a), so the
     product of a series with a whitened step is the sum, from the end, of its products with c.
     """
 
-    def prepare(whiten: Whitener) -> Score:
-        under = Projection(whiten, nuisance, missing, settings)
-        p, n = whiten.order, len(missing)
-        c = np.concatenate([[1.0], -whiten.coefficients])
+    def prepare(under: Projection) -> Score:
+        p, n = under.whiten.order, len(under.missing)
+        c = np.concatenate([[1.0], -under.whiten.coefficients])
         phi = np.cumsum(c)
 
         def pulses(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -109,7 +106,7 @@ def _steps(
 
         return score
 
-    return Variants(prepare, np.ones(len(places)), 2 * nuisance.shape[1])
+    return Variants(prepare, np.ones(len(places)))
 
 
 class LevelShift(Effect):

@@ -15,7 +15,7 @@ from pyro_dynogp.models.variants import Model, with_channel
 from pyro_dynogp.statistics.autoregression import check_samples
 from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
 from pyro_dynogp.statistics.pictures import about, averages, evidence, residual_axis
-from pyro_dynogp.statistics.prewhitening import prewhitened, spanning
+from pyro_dynogp.statistics.prewhitening import Projection, prewhitened, spanning
 from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.statistics.shares_of_inputs import input_columns
 
@@ -66,14 +66,13 @@ def periodic_disturbance(
     nuisance = spanning(nuisance)
     length = next_fast_len(OVERSAMPLING * span, real=True)
     bins = np.arange(int(np.ceil(settings.cycles * length / span)), length // 2)
-    variants = lines(bins, length, nuisance, ~np.isfinite(x), settings)
     deviations = np.zeros((len(r.deviations), span))
     deviations[:, at[kept] - looked[0]] = r.deviations[:, kept]
-    scan = prewhitened(x, variants, deviations, settings, seed=seed)
-    best = bins[scan.best] / length
-    frequency = refined(scan.whitener, x, nuisance, best, 1.0 / length, settings)
+    scan = prewhitened(x, lines(bins, length, settings), nuisance, deviations, settings, seed=seed)
+    under = Projection(scan.whitener, nuisance, ~np.isfinite(x), settings)
+    frequency = refined(under, x, bins[scan.best] / length, 1.0 / length)
     period = r.step / frequency
-    effect, also = harmonics(scan.whitener, x, nuisance, frequency, settings)
+    effect, also = harmonics(under, x, frequency, settings.harmonic)
     size = float(np.sqrt(np.mean(effect**2)))
     more = f", with harmonics {', '.join(map(str, also))}" if also else ""
     return evidence(

@@ -37,28 +37,19 @@ def slots(r: Residuals) -> np.ndarray:
     return at
 
 
-def lines(
-    bins: np.ndarray,
-    length: int,
-    nuisance: np.ndarray,
-    missing: np.ndarray,
-    settings: LoopSettings,
-) -> Variants:
+def lines(bins: np.ndarray, length: int, settings: LoopSettings) -> Variants:
     """Sines at frequencies bins / length [1 / step]: all by one Fourier transform.
 
     A filter makes of a sine a sine of the same frequency, so both span the same, and the
     residual's own past stands beside it as more columns of nuisance.
     """
 
-    def prepare(whiten: Whitener) -> Score:
-        p, n = whiten.order, len(missing)
-        measured = ~missing
-        for k in range(1, p + 1):
-            measured[k:] &= ~missing[: n - k]
-            measured[:k] = False
-        rows = np.flatnonzero(measured)
+    def prepare(under: Projection) -> Score:
+        p, n, nuisance = under.whiten.order, len(under.missing), under.nuisance
+        rows = np.flatnonzero(under.rows) + p
         beside = spanning(nuisance[rows])
-        mask = measured.astype(float)
+        mask = np.zeros(n)
+        mask[rows] = 1.0
         double = fft(mask, length)[(2 * bins) % length]
 
         def parts(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -88,14 +79,14 @@ def lines(
                 line = _wave(n, bins[j] / length)
                 design = np.column_stack([*past, line[rows], nuisance[rows]])
                 noise = Whitener(np.linalg.lstsq(design, x[rows], rcond=1e-9)[0][:p])
-                under = Projection(noise, nuisance, missing, settings)
-                return under.with_nuisance(under.fit(line, x), x)
+                beside_line = Projection(noise, nuisance, under.missing, settings)
+                return beside_line.with_nuisance(beside_line.fit(line, x), x)
 
             return gains, fit
 
         return score
 
-    return Variants(prepare, np.full(len(bins), 2.0), 2 * nuisance.shape[1], joint=True)
+    return Variants(prepare, np.full(len(bins), 2.0), joint=True)
 
 
 def _sine(n: int, frequency: float) -> np.ndarray:
@@ -117,16 +108,8 @@ def _wave(n: int, frequency: float) -> np.ndarray:
     return np.column_stack([*waves, *(shift * wave for wave in waves if inside)])
 
 
-def refined(
-    whiten: Whitener,
-    x: np.ndarray,
-    nuisance: np.ndarray,
-    frequency: float,
-    width: float,
-    settings: LoopSettings,
-) -> float:
+def refined(under: Projection, x: np.ndarray, frequency: float, width: float) -> float:
     """Frequency of largest gain within `width` of one on the grid [1 / step]."""
-    under = Projection(whiten, nuisance, ~np.isfinite(x), settings)
     e = under(x)
 
     def left(f: float) -> float:
@@ -138,10 +121,9 @@ def refined(
 
 
 def harmonics(
-    whiten: Whitener, x: np.ndarray, nuisance: np.ndarray, frequency: float, settings: LoopSettings
+    under: Projection, x: np.ndarray, frequency: float, level: float
 ) -> tuple[np.ndarray, list[int]]:
     """The sine with those harmonics that the data are certain of (n,), and which they are."""
-    under = Projection(whiten, nuisance, ~np.isfinite(x), settings)
     columns, also, n = _sine(len(x), frequency), list[int](), len(x)
     e = under(x)
 
@@ -156,7 +138,7 @@ def harmonics(
         more = np.column_stack([columns, _sine(n, h * frequency)])
         left = total(more)
         gain = len(e) * np.log(max(last, 1e-300) / max(left, 1e-300))
-        if chi2.sf(gain, 2) < settings.harmonic / (HARMONICS - 1):
+        if chi2.sf(gain, 2) < level / (HARMONICS - 1):
             columns, last = more, left
             also.append(h)
     effect = under.fit(columns, x)

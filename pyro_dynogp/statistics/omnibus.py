@@ -156,5 +156,5 @@ def _explained(
     ends = np.cumsum([b.shape[1] for b in blocks])
     places = [np.arange(e - b.shape[1], e) for b, e in zip(blocks, ends, strict=True)]
     columns = standardised(np.column_stack(blocks))
-    variants = free_columns(columns, places, spanning(columns[:, :0]), ~np.isfinite(x), settings)
-    return prewhitened(x, variants, r.deviations, settings, first=_slow(r), seed=seed)
+    variants, none = free_columns(columns, places), spanning(columns[:, :0])
+    return prewhitened(x, variants, none, r.deviations, settings, first=_slow(r), seed=seed)

@@ -21,9 +21,9 @@ from pyro_dynogp.effects.hysteresis import hysteresis
 from pyro_dynogp.effects.level_shift import level_shift
 from pyro_dynogp.effects.periodic import periodic_disturbance
 from pyro_dynogp.effects.saturation import saturation
-from pyro_dynogp.statistics.autoregression import Whitener, fitted_filter
+from pyro_dynogp.statistics.autoregression import fitted_filter
 from pyro_dynogp.statistics.bootstrap import tail_probability
-from pyro_dynogp.statistics.prewhitening import Variants, prewhitened
+from pyro_dynogp.statistics.prewhitening import Projection, Variants, prewhitened
 from pyro_dynogp.statistics.regression import regress
 from pyro_dynogp.statistics.serial import held_out_innovations
 from tests.discrepancy.made import FEW, coloured, lag, residuals_of
@@ -47,17 +47,19 @@ def test_only_the_loop_and_the_command_make_settings():
 def test_every_p_value_has_as_many_replicates():
     x = coloured(np.random.default_rng(0), 200, 0.5)
     column = coloured(np.random.default_rng(1), (200, 1), 0.5)
-    none = np.zeros((0, 200))
+    none, constant = np.zeros((0, 200)), np.ones((200, 1))
     p = regress(x, [column], None, none, other(replicates=39, exceedances=1)).p_value
     assert (40.0 * p) % 1.0 == pytest.approx(0.0, abs=1e-9)
     assert (20.0 * p) % 1.0 != pytest.approx(0.0, abs=1e-9)
 
     def tried(width):
-        def prepare(whiten: Whitener):
+        def prepare(under: Projection):
             return lambda x: (np.array([np.nansum(x[:9])]), lambda j: (0.0 * x, 0.0 * x))
 
         settings = other(replicates=39, fewest_replicates=7, exceedances=1)
-        return prewhitened(x, Variants(prepare, np.ones(1), width), none, settings).p_value
+        return prewhitened(
+            x, Variants(prepare, np.ones(1), width), constant, none, settings
+        ).p_value
 
     assert (8.0 * tried(10**9)) % 1.0 == pytest.approx(0.0, abs=1e-9)
     assert (40.0 * tried(1)) % 1.0 == pytest.approx(0.0, abs=1e-9)
