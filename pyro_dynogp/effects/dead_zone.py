@@ -13,7 +13,7 @@ from pyro_dynogp.effects.base import AROUND, FINER, Effect, changed, number_of
 from pyro_dynogp.models.variants import Model, with_channel
 from pyro_dynogp.statistics.detecting import Search, lasting, one_sided
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
-from pyro_dynogp.statistics.pictures import about, binned, evidence, residual_axis, unexplained
+from pyro_dynogp.statistics.pictures import about, against, evidence
 from pyro_dynogp.statistics.regression import with_past
 from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.statistics.shares_of_inputs import linear_responses, paths
@@ -67,13 +67,7 @@ def dead_zone(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) ->
         {"channel": name, "low": low, "high": high},
         f"Channel '{name}' has no effect on '{r.output_name}' from {low:.3g} to {high:.3g}, "
         f"{about(r, scan.size)}.",
-        binned(
-            r,
-            r.inputs[:, j],
-            unexplained(r, nuisance, scan.fitted),
-            scan.fitted,
-            (name, residual_axis(r)),
-        ),
+        against(r, r.inputs[:, j], name, nuisance, scan.fitted),
     )
 
 

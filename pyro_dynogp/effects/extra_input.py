@@ -15,14 +15,7 @@ from pyro_dynogp.effects.delay_regression import resolved
 from pyro_dynogp.models.variants import Model, with_channel
 from pyro_dynogp.statistics.detecting import Search, lasting
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
-from pyro_dynogp.statistics.pictures import (
-    about,
-    binned,
-    evidence,
-    residual_axis,
-    unexplained,
-    unit,
-)
+from pyro_dynogp.statistics.pictures import about, against, evidence, unit
 from pyro_dynogp.statistics.responses import responses, standardised
 from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.statistics.shares_of_inputs import input_columns
@@ -70,7 +63,6 @@ def _extra(
     tried = [(f, d) for f in forms for d in (coarse[:1] if f.startswith("product") else coarse)]
     scan = lasting(r, [bank(forms[f], d) for f, d in tried], nuisance, settings, seed)
     form, delay = tried[scan.best]
-    fitted = scan.fitted
     if scan.p_value < settings.noticed:
         search = Search(r, nuisance, settings)
         grid = np.concatenate([[0.0], np.geomspace(0.5 * r.step, longest, 24)])
@@ -87,13 +79,7 @@ def _extra(
         {"channel": name, "form": form, "delay": delay},
         f"Channel '{name}' acts on '{r.output_name}'{how.get(form, f' as {form}')}{late}, "
         f"{about(r, scan.size)}.",
-        binned(
-            r,
-            delayed(held(r.candidates[name]), r.time, delay),
-            unexplained(r, nuisance, fitted),
-            fitted,
-            (name, residual_axis(r)),
-        ),
+        against(r, delayed(held(r.candidates[name]), r.time, delay), name, nuisance, scan.fitted),
     )
 
 

@@ -12,7 +12,7 @@ from pyro_dynogp.effects.base import Effect
 from pyro_dynogp.models.variants import Model, with_input_function
 from pyro_dynogp.statistics.detecting import lasting
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
-from pyro_dynogp.statistics.pictures import about, binned, evidence, residual_axis, unexplained
+from pyro_dynogp.statistics.pictures import about, against, evidence
 from pyro_dynogp.statistics.regression import with_past
 from pyro_dynogp.statistics.responses import responses
 from pyro_dynogp.statistics.settings import LoopSettings
@@ -39,14 +39,13 @@ def input_nonlinearity(residuals: Residuals, settings: LoopSettings, *, seed: in
     scan = lasting(r, [columns for _, columns in tried], nuisance, settings, seed)
     j = tried[scan.best][0]
     name = r.input_names[j]
-    axes = (name, residual_axis(r))
     return evidence(
         "input nonlinearity",
         scan,
         {"channel": name},
         f"Channel '{name}' acts on '{r.output_name}' through a nonlinear function of itself, "
         f"{about(r, scan.size)}.",
-        binned(r, r.inputs[:, j], unexplained(r, nuisance, scan.fitted), scan.fitted, axes),
+        against(r, r.inputs[:, j], name, nuisance, scan.fitted),
     )
 
 

@@ -11,14 +11,7 @@ from pyro_dynogp.effects.base import Effect
 from pyro_dynogp.models.variants import Model, with_output_function
 from pyro_dynogp.statistics.detecting import lasting
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
-from pyro_dynogp.statistics.pictures import (
-    about,
-    binned,
-    evidence,
-    labelled,
-    residual_axis,
-    unexplained,
-)
+from pyro_dynogp.statistics.pictures import about, against, evidence, labelled
 from pyro_dynogp.statistics.regression import with_past
 from pyro_dynogp.statistics.settings import LoopSettings
 
@@ -35,13 +28,13 @@ def output_nonlinearity(residuals: Residuals, settings: LoopSettings, *, seed: i
     variants = [powers[:, :1], powers[:, 1:], powers, bends, *bends.T]
     variants, nuisance = [with_past(v) for v in variants], with_past(r.mean)
     scan = lasting(r, variants, nuisance, settings, seed)
-    axes = (labelled(f"simulated {r.output_name}", r.output_unit), residual_axis(r))
+    label = labelled(f"simulated {r.output_name}", r.output_unit)
     return evidence(
         "output nonlinearity",
         scan,
         {},
         f"'{r.output_name}' is a nonlinear function of what the model says, {about(r, scan.size)}.",
-        binned(r, r.mean, unexplained(r, nuisance, scan.fitted), scan.fitted, axes),
+        against(r, r.mean, label, nuisance, scan.fitted),
     )
 
 

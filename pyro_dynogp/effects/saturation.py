@@ -63,22 +63,13 @@ def saturation(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -
         p = 1.0 if noticed and slope > settings.flat else p
         how = ""
     limits = [f"{at:.4g}{unit(r.output_unit)}" for at in (low, high) if np.isfinite(at)]
-    flattened = np.clip(r.mean, low, high)
+    label = labelled(r.output_name, r.output_unit)
     return evidence(
         "saturation",
         replace(scan, statistic=statistic, p_value=p, gains=np.array([gain]), best=0),
         {"low": low, "high": high},
         f"'{r.output_name}' stops at {' and '.join(limits)}{how}, {about(r, size)}.",
-        binned(
-            r,
-            r.mean,
-            r.output,
-            flattened,
-            (
-                labelled(f"simulated {r.output_name}", r.output_unit),
-                labelled(r.output_name, r.output_unit),
-            ),
-        ),
+        binned(r, r.mean, r.output, np.clip(r.mean, low, high), (f"simulated {label}", label)),
         size,
     )
 

@@ -93,9 +93,16 @@ def over_time(r: Residuals, fitted: np.ndarray, blocks: int = 80) -> Curve:
     return Curve(time, left, effect, f"time [{r.time_unit}]", residual_axis(r))
 
 
-def unexplained(r: Residuals, nuisance: np.ndarray, fitted: np.ndarray) -> np.ndarray:
-    """Residual (n,) less what the nuisance explains of it beside the effect."""
+def against(
+    r: Residuals, x: np.ndarray, label: str, nuisance: np.ndarray, fitted: np.ndarray
+) -> Curve:
+    """Residual and effect over a signal x (n,): less what the nuisance explains beside the effect.
+
+    Args:
+        r: residuals. label: of x. nuisance: (n, M). fitted: (n,) the effect.
+    """
     e = r.residual
     rows = r.held_out & np.isfinite(e)
     columns = np.column_stack([np.ones(len(e)), nuisance, fitted])
-    return e - columns[:, :-1] @ solve(columns[rows], e[rows])[:-1]
+    rest = e - columns[:, :-1] @ solve(columns[rows], e[rows])[:-1]
+    return binned(r, x, rest, fitted, (label, residual_axis(r)))

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy import stats
+from scipy.signal import cont2discrete, lfilter
 
 import pyro_dynogp as dgp
 from pyro_dynogp.data.signals import delayed, play
@@ -15,7 +16,7 @@ from pyro_dynogp.effects.clock_shift import _preferred
 from pyro_dynogp.effects.clock_shift_score import shifts_of
 from pyro_dynogp.effects.dead_time import dead_time
 from pyro_dynogp.effects.dead_zone import dead_zone
-from pyro_dynogp.effects.extra_input import extra_input
+from pyro_dynogp.effects.dynamics import unmodelled_dynamics
 from pyro_dynogp.effects.heavy_tails import heavy_tails
 from pyro_dynogp.effects.hysteresis import hysteresis
 from pyro_dynogp.effects.level_shift import level_shift
@@ -28,7 +29,7 @@ from pyro_dynogp.statistics.regression import regress
 from pyro_dynogp.statistics.serial import held_out_innovations
 from tests.discrepancy.made import FEW, coloured, lag, residuals_of
 from tests.discrepancy.series import residuals
-from tests.effects.scenes import stamps, step_inputs, two_paths
+from tests.effects.scenes import first_extra, stamps, step_inputs, two_paths
 
 PACKAGE = Path(dgp.__file__).parent
 
@@ -104,9 +105,35 @@ def with_play():
     return residuals_of(a + lag(play(u[:, 1], 0.7), 0.8) + e, a + b, u)
 
 
+def with_resonance():
+    _, u, parts, e = step_inputs(5, inputs=1)
+    system = cont2discrete(([9.0], [1.0, 0.9, 9.0]), 0.1)
+    return residuals_of(parts[:, 0] + lfilter(system[0].ravel(), system[1], u[:, 0]) + e,
+                        parts[:, 0], u)  # fmt: skip
+
+
+def with_channel():
+    rng, u, parts, e = step_inputs(2)
+    w = coloured(rng, 400, 0.7)
+    y = parts.sum(1) + e + 0.8 * lag(delayed(w, 0.1 * np.arange(400), 1.25), 0.3)
+    return residuals_of(y, parts.sum(1), u, {"w": w})
+
+
+def with_limit():
+    u, a, b, e = two_paths(6)
+    return residuals_of(np.minimum(a + b, 0.35) + e, a + b, u)
+
+
 @pytest.mark.parametrize(
     ("detector", "scene", "key"),
-    [(dead_time, late, "delay"), (dead_zone, with_zone, "low"), (hysteresis, with_play, "width")],
+    [
+        (dead_time, late, "delay"),
+        (dead_zone, with_zone, "low"),
+        (hysteresis, with_play, "width"),
+        (unmodelled_dynamics, with_resonance, "frequency"),
+        (first_extra, with_channel, "delay"),
+        (saturation, with_limit, "high"),
+    ],
 )
 def test_what_is_noticed_is_looked_at_more_finely(detector, scene, key):
     r = scene()
@@ -115,12 +142,9 @@ def test_what_is_noticed_is_looked_at_more_finely(detector, scene, key):
 
 
 def test_a_delay_must_pay_for_itself():
-    rng, u, parts, e = step_inputs(2)
-    w = coloured(rng, 400, 0.7)
-    y = parts.sum(1) + e + 0.8 * lag(delayed(w, 0.1 * np.arange(400), 1.25), 0.3)
-    r = residuals_of(y, parts.sum(1), u, {"w": w})
-    assert extra_input(r, FEW)[0].where["delay"] > 1.0
-    assert extra_input(r, other(preference=1e6))[0].where["delay"] == 0.0
+    r = with_channel()
+    assert first_extra(r, FEW).where["delay"] > 1.0
+    assert first_extra(r, other(preference=1e6)).where["delay"] == 0.0
 
 
 def test_another_clock_must_pay_for_itself():
