@@ -10,7 +10,7 @@ LINES_OF_A_FILE = 330
 LINES_OF_A_FUNCTION = 80  # its docstring not counted
 ARGUMENTS = 12
 LINES = 31_500
-LINES_TODAY = 36_600  # the package of the version before had 34 928; to shrink, and to go
+LINES_TODAY = 36_300  # the package of the version before had 34 928; to shrink, and to go
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

@@ -11,7 +11,6 @@ import pyro_dynogp as dgp
 from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.data.channels import Recorded
 from pyro_dynogp.discrepancy.refits import quick_fit
-from pyro_dynogp.discrepancy.settings import DEFAULTS
 from pyro_dynogp.discrepancy.trials import held_out_density
 from pyro_dynogp.inference.methods import mode as cascade_fit
 from pyro_dynogp.inference.methods.base import Problem
@@ -20,7 +19,7 @@ from pyro_dynogp.inference.optimise.maximum import maximise
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.poles import grown
 from pyro_dynogp.models.variants import with_channel, with_pairs, without_process_noise
-from tests.discrepancy.made import coloured
+from tests.discrepancy.made import SETTINGS, coloured
 from tests.discrepancy.plant_dynamics import System, response
 
 ALONE = Run(workers=1)
@@ -79,7 +78,7 @@ def test_an_extended_cascade_explains_what_its_base_lacks(record, base):
     gain = held_out_density(fit, record, fold, "forecast")
     gain = gain - held_out_density(base, record, fold, "forecast")
     # What the loop asks of an effect.
-    assert gain.sum() > max(DEFAULTS.gain, DEFAULTS.standard_errors * block_standard_error(gain)[0])
+    assert gain.sum() > max(SETTINGS.gain, SETTINGS.standard_errors * block_standard_error(gain)[0])
     error = fit.forecast(training, record[TRAINING:]).mean - record.outputs[TRAINING:]
     # 100 samples; the bend and both responses are known to some 10 % of the noise each.
     assert np.sqrt(np.mean(error**2)) < 1.3 * NOISE
