@@ -16,6 +16,7 @@ from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.finding import apart
 from pyro_dynogp.criticism.kept_draws import kept
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.inference.cascade_coordinates import StraightPotential
 from pyro_dynogp.inference.density import Potential, log_prob_by_draw
 from pyro_dynogp.inference.methods import annealed as annealing
 from pyro_dynogp.inference.posteriors import Draws, Mixture
@@ -85,8 +86,9 @@ def draws_of(
     NUTS: its draws. A variational posterior: fresh draws of it; of a cascade by default those of
     inducing values and first states, with all else at an optimum, whose own uncertainty then
     counts nowhere. A posterior mode: Laplace's approximation around it. Where Pareto's k says that
-    a normal does not describe the posterior of a linear model, particles are annealed from it to
-    the posterior itself (`inference.annealing`).
+    a normal does not describe the posterior of a linear model, another one is taken that is normal
+    in coordinates without bent ridges (`inference.cascade_coordinates`); where that does not
+    either, particles are annealed from it to the posterior itself (`inference.methods.annealed`).
 
     Args:
         fit: the fit. count: number of draws S (of NUTS all there are). seed: for them.
@@ -165,20 +167,64 @@ def _annealed(
             advice="Fit with method='svi' (the default of cascades) or 'nuts', or use "
             "parameters='mode'.",
         )
-    normal = normal_of(fit)
-    z, start = annealing.around(normal, count, seed)
-    target = annealing.Joint(fit.model.collapsed, (fit.model.prepare(fit.records),), normal.sites)
     with seeded(seed):
-        annealed = annealing.anneal(z, start, target, seed=seed, progress=progress)
-        values = FrozenMapping(normal.at_latent(annealed.z))
+        prepared = (fit.model.prepare(fit.records),)
+        potential = StraightPotential(fit.model.collapsed, prepared, fit.mode)
+        loc, root = map(torch.as_tensor, potential.laplace(fit.mode))
+        z, start = annealing.around(loc, root, count, seed)
+        target = annealing.Joint(potential, _samples(fit.records))
+        ratio = (target(z)[0] - start(z)[0]).numpy()
+        straight = float(arviz_bridge.psis(ratio)[1]) <= arviz_bridge.good_k(count)
+        found = None
+        if not straight:
+            found = annealing.anneal(z, start, target, seed=seed, progress=progress)
+            z = found.z
+        with torch.no_grad():
+            values = FrozenMapping(potential.unpack(z))
+    log_p = log_joint(fit, values)
+    way = "annealed" if found else "a Student-t in straight coordinates"
     return PosteriorDraws(
         values,
-        log_joint(fit, values),
-        None,
+        log_p,
+        None if found else log_p - ratio,
         np.zeros(count, dtype=int),
-        f"annealed from {own.kind}, whose own Pareto k is {shape}",
-        annealed.ancestor,
+        f"{way} from {own.kind}, whose own Pareto k is {shape}",
+        found.ancestor if found else None,
     )
+
+
+def carried(
+    old: Fitted, draws: PosteriorDraws, new: Fitted, *, seed: int, progress: bool = False
+) -> PosteriorDraws:
+    """Draws of a posterior moved to that given other data, without a fit (Chopin 2002).
+
+    Particles are annealed from the one to the other; draws of another density are resampled by
+    their ratios first.
+
+    Args:
+        old: a fit without static functions. draws: of its posterior.
+        new: the same with other records. seed: of the moves. progress: whether to show a bar.
+    """
+    data = (old.model.prepare(old.records),)
+    before = StraightPotential(old.model.collapsed, data, old.mode)
+    after = before.on((new.model.prepare(new.records),))
+    start, target = (
+        annealing.Joint(potential, _samples(fit.records))
+        for potential, fit in ((before, old), (after, new))
+    )
+    count = len(draws)
+    generator = np.random.default_rng(seed)
+    weight = np.exp(arviz_bridge.psis(draws.log_ratio)[0])
+    first = np.searchsorted(np.cumsum(weight), (np.arange(count) + generator.random()) / count)
+    first = np.minimum(first, count - 1)
+    z = before.pack(draws.values)[first]
+    found = annealing.anneal(z, start, target, seed=seed, progress=progress)
+    with torch.no_grad():
+        values = FrozenMapping(after.unpack(found.z))
+    roots = np.arange(count) if draws.ancestor is None else draws.ancestor
+    kind = "annealed from draws given other data"
+    group = np.zeros(count, dtype=int)
+    return PosteriorDraws(values, None, None, group, kind, roots[first[found.ancestor]])
 
 
 def log_joint(fit: Fitted, values: Values) -> np.ndarray:

@@ -16,6 +16,7 @@ from pyro_dynogp.criticism.posterior_draws import (
     AT_ONCE,
     PosteriorDraws,
     Values,
+    carried,
     draws_of,
 )
 from pyro_dynogp.data.record import Record
@@ -66,6 +67,7 @@ class FitSubject:
         records: where densities are evaluated. count, seed: of the draws.
         parameters: "posterior", or "mode" for the mode alone.
         progress: whether drawing shows a bar where it takes long.
+        drawn: draws of the posterior, where they did not come from the fit.
     """
 
     fit: Fitted
@@ -74,10 +76,13 @@ class FitSubject:
     seed: int
     parameters: Parameters = "posterior"
     progress: bool = False
+    drawn: PosteriorDraws | None = None
 
     @property
     def draws(self) -> PosteriorDraws:
         """Draws (S) of the posterior, kept with the fit, or the mode as the only one."""
+        if self.drawn is not None:
+            return self.drawn
         if self.parameters == "mode":
             values = {name: value.unsqueeze(0) for name, value in self.fit.mode.items()}
             return PosteriorDraws(values, None, None, np.zeros(1, dtype=int), "at the mode")
@@ -122,6 +127,22 @@ class FitSubject:
 
     def without(self, left_out: np.ndarray) -> FitSubject:
         """The same model fitted without some samples (N,)."""
+        fit = refit(self.fit, self._rest(left_out))
+        return replace(self, fit=fit, progress=False, drawn=None)
+
+    @property
+    def carries(self) -> bool:
+        """Whether draws can be moved to other data without a fit, as `carried` does."""
+        known = self.parameters == "mode" or self.fit.model.has_function
+        return self.fit.method == "map" and not known
+
+    def carried(self, left_out: np.ndarray) -> FitSubject:
+        """As `without`, by these draws moved to the posterior given those data."""
+        fit = replace(self.fit, records=tuple(self._rest(left_out)))
+        return replace(self, fit=fit, drawn=carried(self.fit, self.draws, fit, seed=self.seed))
+
+    def _rest(self, left_out: np.ndarray) -> list[Record]:
+        """The records without some samples (N,)."""
         rest = []
         for index, record in enumerate(self.records):
             own = self.places["record"] == index
@@ -133,7 +154,7 @@ class FitSubject:
             rest.append(record.with_outputs(y)[: max(there[-1] + 1 if len(there) else 0, 2)])
         if all(one.missing.all() for one in rest):
             raise invalid("record", expected="samples left to fit to", got="none")
-        return replace(self, fit=refit(self.fit, rest), progress=False)
+        return rest
 
 
 def densities_at(

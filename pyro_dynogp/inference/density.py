@@ -196,7 +196,7 @@ class Potential:
         A mode may lie on a boundary to the last digit, where the vector would be infinite.
         """
         parts = [site.transform.inv(values[site.name]).reshape(-1) for site in self.sites]
-        return torch.cat(parts).detach().nan_to_num(nan=math.nan, posinf=EDGE, neginf=-EDGE)
+        return within_edges(torch.cat(parts))
 
     def unpack(self, z: Tensor) -> dict[str, Tensor]:
         """Unconstrained vectors (*s, d) to constrained values (*s, *shape) of every site."""
@@ -289,3 +289,8 @@ class Potential:
 
 # Unconstrained value of what lies on a boundary: within 1e-13 of it.
 EDGE = 30.0
+
+
+def within_edges(z: Tensor) -> Tensor:
+    """Unconstrained vectors, finite where values lie on a boundary."""
+    return z.detach().nan_to_num(nan=math.nan, posinf=EDGE, neginf=-EDGE)
