@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any, get_args
 
 import numpy as np
@@ -13,6 +14,7 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.density import WALL
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.methods.base import Problem
+from pyro_dynogp.inference.optimise.gauss_newton import has_innovations
 from pyro_dynogp.inference.optimise.maximum import EFFORT, Optimizer, Optimum, maximise
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.run import Run
@@ -33,9 +35,13 @@ from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import seeded
 
+# Most iterations of linear fits by each optimizer.
+STEPS: Mapping[str, int] = MappingProxyType(
+    {"gauss-newton": 100, "lbfgs": 500, "preconditioned": 500, "adam": 1500}
+)
 # Starts and iterations of the linear fits that come first.
 LINEAR_STARTS = 6
-LINEAR_STEPS = 150
+LINEAR_STEPS = 60
 # Measurement noise, in sds of the outputs, from which starts without process noise climb at least.
 UNEXPLAINED = 0.5
 
@@ -64,6 +70,7 @@ def starting_points(
                 twin,
                 training if len(training) > 1 else training[0],
                 starting_values(twin, training, count=LINEAR_STARTS, seed=seed),
+                optimizer=optimizer_for(twin),
                 steps=min(LINEAR_STEPS, steps),
                 seed=seed,
                 workers=workers,
@@ -102,9 +109,10 @@ class Mode:
     """The posterior mode: the best optimum of several starts.
 
     Attributes:
-        optimizer: "lbfgs", "preconditioned" (L-BFGS in coordinates that Hessians make round, which
-            gets to the top of long ridges) or "adam"; None for "adam" where the model has static
-            layers, else "lbfgs". The highest mode may be one that fits the noise.
+        optimizer: "gauss-newton" (for linear models under Gaussian noise), "lbfgs",
+            "preconditioned" (L-BFGS in coordinates that Hessians make round, which gets to the top
+            of long ridges) or "adam"; None for what suits the model, see `optimizer_for`. The
+            highest mode may be one that fits the noise.
 
     Raises:
         ValueError: on an unknown optimizer.
@@ -116,7 +124,8 @@ class Mode:
         check_optimizer(self.optimizer)
 
     def check(self, model: Model, *, warm: bool) -> None:
-        """Every model has a mode."""
+        """Every model has a mode; not every optimizer takes every model."""
+        check_optimizer(self.optimizer, model)
 
     @property
     def identity(self) -> object:
@@ -129,15 +138,25 @@ class Mode:
         return at_optimum(problem.model, optima, run.seed, problem.records)
 
 
-def check_optimizer(optimizer: Optimizer | None) -> None:
-    """Refuse an optimizer that there is not.
+def check_optimizer(optimizer: Optimizer | None, model: Model | None = None) -> None:
+    """Refuse an optimizer that there is not, or that cannot climb a given model's posterior.
 
     Raises:
-        ValueError: on an unknown name.
+        ValueError: on such a name.
     """
-    if optimizer is not None and optimizer not in get_args(Optimizer):
-        expected = "'lbfgs', 'preconditioned' or 'adam'"
-        raise invalid("optimizer", expected=expected, got=repr(optimizer))
+    names = list(get_args(Optimizer))
+    if model is not None and not has_innovations(model):
+        names.remove("gauss-newton")
+    if optimizer is not None and optimizer not in names:
+        *most, last = (repr(name) for name in names)
+        raise invalid("optimizer", expected=f"{', '.join(most)} or {last}", got=repr(optimizer))
+
+
+def optimizer_for(model: Model) -> Optimizer:
+    """Gauss-Newton where outputs have Gaussian innovations, Adam where there are functions."""
+    if has_innovations(model):
+        return "gauss-newton"
+    return "adam" if model.has_function else "lbfgs"
 
 
 def best_optima(
@@ -153,7 +172,7 @@ def best_optima(
         ValueError: where no start leads to a point with a density.
     """
     model, records, learnt = problem.model, problem.records, problem.learnt
-    optimizer = optimizer or ("adam" if model.has_function else "lbfgs")
+    optimizer = optimizer or optimizer_for(model)
     restarts = run.restarts or (8 if model.has_function else 6)
     options: dict[str, Any] = {
         "optimizer": optimizer, "seed": run.seed, "workers": run.workers,
@@ -163,7 +182,7 @@ def best_optima(
         starts = starting_values(model, records, count=restarts, seed=run.seed)
         if learnt is not None:
             starts = [grown(learnt, starts[0]), *starts]
-        steps = steps or (1500 if optimizer == "adam" else 500)
+        steps = steps or STEPS[optimizer]
         optima = maximise(problem.target, problem.argument, starts, steps=steps, **options)
     else:
         steps = steps or 600

@@ -14,6 +14,7 @@ from torch import Tensor
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.records import as_records
 from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.optimise import gauss_newton
 from pyro_dynogp.inference.optimise.descent import descend, lbfgs
 from pyro_dynogp.inference.optimise.lockstep import Functions, in_lockstep
 from pyro_dynogp.support.checkpoints import (
@@ -25,7 +26,7 @@ from pyro_dynogp.support.checkpoints import (
 )
 from pyro_dynogp.support.parallel import parallel_map, seeded
 
-Optimizer = Literal["lbfgs", "preconditioned", "adam"]
+Optimizer = Literal["gauss-newton", "lbfgs", "preconditioned", "adam"]
 # Adam's first step, and how often it goes back to the best point with a shorter one.
 RATE, RETURNS = 0.02, 2
 # Starts that climb together, as long as they have no more samples than this in all: longer records
@@ -156,20 +157,27 @@ def _optimise(task: _Task) -> list[Optimum]:
 def _climb(task: _Task) -> list[Optimum]:
     with seeded(task.seed):
         potential = Potential(task.model, (task.records,), task.starts[0])
-        method = _METHODS[task.optimizer]
-        every = potential.hessian_cost  # of a climb, Hessians are at most half the work
-
-        def run(start: dict[str, Tensor]) -> Callable[[Functions], tuple[np.ndarray, list, str]]:
-            z = potential.pack(start).numpy()
-            return lambda functions: method(functions, z, task, every)
-
-        found = in_lockstep(potential.values_and_gradients, [run(start) for start in task.starts])
+        found = _climbs(potential, task)
         ends = np.stack([z for z, _, _ in found])
         energies = potential.values_and_gradients(ends)[0]
         return [
             Optimum(float(energy), _values(potential, z), np.asarray(history), message)
             for energy, (z, history, message) in zip(energies, found, strict=True)
         ]
+
+
+def _climbs(potential: Potential, task: _Task) -> list[tuple[np.ndarray, list, str]]:
+    starts = [potential.pack(start).numpy() for start in task.starts]
+    if task.optimizer == "gauss-newton":
+        innovations = gauss_newton.Innovations(potential)
+        return [gauss_newton.climb(innovations, z, task.steps) for z in starts]
+    method = _METHODS[task.optimizer]
+    every = potential.hessian_cost  # of a climb, Hessians are at most half the work
+
+    def run(z: np.ndarray) -> Callable[[Functions], tuple[np.ndarray, list, str]]:
+        return lambda functions: method(functions, z, task, every)
+
+    return in_lockstep(potential.values_and_gradients, [run(z) for z in starts])
 
 
 def _values(potential: Potential, z: np.ndarray) -> dict[str, Tensor]:
@@ -232,6 +240,8 @@ def maximise(
     values (no Jacobian), as AutoDelta has it. The result does not depend on the number of
     processors.
     """
+    # Gauss-Newton evaluates several points by itself.
+    together = 1 if optimizer == "gauss-newton" else effort.together
 
     def climb(values: Sequence[dict[str, Tensor]], count: int, label: str) -> list[Optimum]:
         tasks = [
@@ -247,7 +257,7 @@ def maximise(
                 effort.rate,
                 effort.near or label == "optima",
             )
-            for i, batch in enumerate(_batches(values, model, records, effort.together))
+            for i, batch in enumerate(_batches(values, model, records, together))
         ]
         found = parallel_map(
             _optimise,
