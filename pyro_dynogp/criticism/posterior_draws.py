@@ -17,7 +17,8 @@ from pyro_dynogp.criticism.finding import apart
 from pyro_dynogp.criticism.kept_draws import kept
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.cascade_coordinates import StraightPotential
-from pyro_dynogp.inference.density import Potential, log_prob_by_draw
+from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.log_joint import log_prob_by_draw
 from pyro_dynogp.inference.methods import annealed as annealing
 from pyro_dynogp.inference.posteriors import Draws, Mixture
 from pyro_dynogp.layers.sites import Arguments, Program

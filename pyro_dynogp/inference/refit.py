@@ -12,6 +12,7 @@ from torch import Tensor
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.methods.base import Problem
+from pyro_dynogp.inference.methods.mode import optimizer_for
 from pyro_dynogp.inference.methods.nuts import sample_posterior
 from pyro_dynogp.inference.methods.optima import POLISH, Hyperparameters, posterior_of
 from pyro_dynogp.inference.methods.svi import Schedule
@@ -23,7 +24,7 @@ from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import seeded
 
-# Iterations from the old optimum: of L-BFGS, of Adam, of SVI for all sites.
+# Most iterations from the old optimum: of linear models, of Adam, of SVI for all sites.
 LINEAR_STEPS, CASCADE_STEPS, SVI_STEPS = 300, 200, 400
 # Adam's first step: the old optimum is close by.
 REFIT_RATE = 0.004
@@ -56,13 +57,13 @@ def refit(fit: FittedKind, records: Record | Sequence[Record]) -> FittedKind:
         raise invalid("records", expected=f"{len(fit.records)}, as before", got=str(len(several)))
     problem = Problem(fit.model, fit.model.prepare(several))
     run = Run(fit.seed, workers=1)
-    cascade = fit.model.has_function
+    cascade, optimizer = fit.model.has_function, optimizer_for(fit.model)
     optima = maximise(
         problem.target,
         problem.records,
         optima_of(fit),
         run,
-        optimizer="adam" if cascade else "lbfgs",
+        optimizer=optimizer,
         steps=CASCADE_STEPS if cascade else LINEAR_STEPS,
         effort=Effort(kept=1.0, rate=REFIT_RATE),
     )

@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import pyro
 import torch
+from torch import Tensor
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.scaling import Scaling
@@ -45,16 +45,15 @@ def at_limits(layers: Sequence[Layer], record: Record) -> np.ndarray:
     return there
 
 
-def count_as_probabilities(at: np.ndarray, outputs: OutputProcess, suffix: str) -> None:
-    """Take outputs that are exactly at a limit for what they are: probabilities.
+def log_probability_scale(at: np.ndarray, outputs: OutputProcess) -> Tensor:
+    """What makes probabilities () or (k,) of the densities of outputs that are exactly at a limit.
 
     Their density, which has no upper bound where the noise vanishes, times sqrt(2 pi) times the
     noise's scale is at most one, as the probability of being beyond the limit is.
 
     Args:
-        at: (n,) where they are. outputs: of the record. suffix: of the record's sites.
+        at: (n,) where they are. outputs: of the record.
     """
-    if at.any():
-        sd = outputs.noise_sd[..., 0]
-        sd = sd.expand((*sd.shape[:-1], len(at)))[..., torch.as_tensor(at)]
-        pyro.factor(f"at_limits{suffix}", (sd.log() + 0.5 * math.log(2.0 * math.pi)).sum(-1))
+    sd = outputs.noise_sd[..., 0]
+    sd = sd.expand((*sd.shape[:-1], len(at)))[..., torch.as_tensor(at)]
+    return (sd.log() + 0.5 * math.log(2.0 * math.pi)).sum(-1)

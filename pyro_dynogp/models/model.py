@@ -16,7 +16,7 @@ from pyro_dynogp.layers.functions import StaticFunction, support_points
 from pyro_dynogp.layers.sites import Site, Values, sample
 from pyro_dynogp.layers.static import StaticPrior
 from pyro_dynogp.models.explicit import observe_explicit
-from pyro_dynogp.models.limits import at_limits, count_as_probabilities, scaled_limits
+from pyro_dynogp.models.limits import at_limits, log_probability_scale, scaled_limits
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.prepared import Records
 from pyro_dynogp.models.priors import FLAT, ModesPrior, TimeScale, direct_site
@@ -221,8 +221,11 @@ class Model(Structure):
                 y = record.observations if record.has_outputs else None
                 pyro.sample(f"y{suffix}", outputs, obs=y)
             else:
-                observe_explicit(outputs, along, suffix, last_integrated=self.integrate == "last")
-            count_as_probabilities(at_limits(self.layers, record.record), outputs, suffix)
+                last = self.integrate == "last"
+                observe_explicit(outputs, along, suffix, last_integrated=last)
+            at = at_limits(self.layers, record.record)
+            if at.any():
+                pyro.factor(f"at_limits{suffix}", log_probability_scale(at, outputs))
 
     def sample_states(self, suffix: str) -> dict[str, Tensor]:
         """Sample what past inputs left at the first sample of a record, by layer."""

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import zip_longest
+from types import MappingProxyType
 from typing import get_args
 
 import numpy as np
@@ -13,6 +15,7 @@ from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.density import WALL
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.methods.base import Problem
+from pyro_dynogp.inference.optimise.gauss_newton import has_innovations
 from pyro_dynogp.inference.optimise.maximum import EFFORT, Effort, Optimizer, Optimum, maximise
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.run import Run
@@ -24,6 +27,7 @@ from pyro_dynogp.inference.starts.plans import (
     starting_point,
 )
 from pyro_dynogp.inference.starts.poles import grown, starting_values
+from pyro_dynogp.inference.starts.subspace import subspace_starts
 from pyro_dynogp.layers.noise import TYPICAL
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord, Records, as_measured
@@ -33,9 +37,13 @@ from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import seeded
 
-# Starts and iterations of the linear fits that come first.
-LINEAR_STARTS = 6
-LINEAR_STEPS = 150
+# Most iterations of linear fits by each optimizer.
+STEPS: Mapping[str, int] = MappingProxyType(
+    {"gauss-newton": 60, "lbfgs": 500, "preconditioned": 500, "adam": 1500}
+)
+# Starts of linear fits with random poles; iterations of those that come before cascades.
+RANDOM = 6
+LINEAR_STEPS = 40
 # Measurement noise, in sds of the outputs, from which starts without process noise climb at least.
 UNEXPLAINED = 0.5
 
@@ -61,8 +69,9 @@ def starting_points(
             found = maximise(
                 twin,
                 training,
-                starting_values(twin, training, count=LINEAR_STARTS, seed=run.seed),
+                linear_starts(twin, training, None, run.seed),
                 run,
+                optimizer=optimizer_for(twin),
                 steps=min(LINEAR_STEPS, steps),
                 key=f"linear-{one.name}",
             )
@@ -99,9 +108,10 @@ class Mode:
     """The posterior mode: the best optimum of several starts.
 
     Attributes:
-        optimizer: "lbfgs", "preconditioned" (L-BFGS in coordinates that Hessians make round, which
-            gets to the top of long ridges) or "adam"; None for "adam" where the model has static
-            layers, else "lbfgs". The highest mode may be one that fits the noise.
+        optimizer: "gauss-newton" (for linear models under Gaussian noise), "lbfgs",
+            "preconditioned" (L-BFGS in coordinates that Hessians make round, which gets to the top
+            of long ridges) or "adam"; None for what suits the model, see `optimizer_for`. The
+            highest mode may be one that fits the noise.
 
     Raises:
         ValueError: on an unknown optimizer.
@@ -113,7 +123,8 @@ class Mode:
         check_optimizer(self.optimizer)
 
     def check(self, model: Model, *, warm: bool) -> None:
-        """Every model has a mode."""
+        """Every model has a mode; not every optimizer takes every model."""
+        check_optimizer(self.optimizer, model)
 
     @property
     def identity(self) -> object:
@@ -126,15 +137,25 @@ class Mode:
         return at_optimum(problem.model, optima, run.seed, problem.records)
 
 
-def check_optimizer(optimizer: Optimizer | None) -> None:
-    """Refuse an optimizer that there is not.
+def check_optimizer(optimizer: Optimizer | None, model: Model | None = None) -> None:
+    """Refuse an optimizer that there is not, or that cannot climb a given model's posterior.
 
     Raises:
-        ValueError: on an unknown name.
+        ValueError: on such a name.
     """
-    if optimizer is not None and optimizer not in get_args(Optimizer):
-        expected = "'lbfgs', 'preconditioned' or 'adam'"
-        raise invalid("optimizer", expected=expected, got=repr(optimizer))
+    names = list(get_args(Optimizer))
+    if model is not None and not has_innovations(model):
+        names.remove("gauss-newton")
+    if optimizer is not None and optimizer not in names:
+        *most, last = (repr(name) for name in names)
+        raise invalid("optimizer", expected=f"{', '.join(most)} or {last}", got=repr(optimizer))
+
+
+def optimizer_for(model: Model) -> Optimizer:
+    """Gauss-Newton where outputs have Gaussian innovations, Adam where there are functions."""
+    if has_innovations(model):
+        return "gauss-newton"
+    return "adam" if model.has_function else "lbfgs"
 
 
 def best_optima(
@@ -150,16 +171,16 @@ def best_optima(
         ValueError: where no start leads to a point with a density.
     """
     model, records, learnt = problem.model, problem.records, problem.learnt
-    optimizer = optimizer or ("adam" if model.has_function else "lbfgs")
-    restarts = run.restarts or (8 if model.has_function else 6)
+    optimizer = optimizer or optimizer_for(model)
     if model.is_linear:
-        starts = starting_values(model, records, count=restarts, seed=run.seed)
+        starts = linear_starts(model, records, run.restarts, run.seed)
         if learnt is not None:
             starts = [grown(learnt, starts[0]), *starts]
-        steps = steps or (1500 if optimizer == "adam" else 500)
+        steps = steps or STEPS[optimizer]
         optima = maximise(problem.target, records, starts, run, steps=steps, optimizer=optimizer)
     else:
         steps = steps or 600
+        restarts = run.restarts or (8 if model.has_function else RANDOM)
         starts = starting_points(problem.target, records, run, count=restarts, steps=steps)
         warm = [] if learnt is None else [grown(learnt, starts[0])]
         optima = climb(problem.target, records, starts, warm, run, steps=steps, optimizer=optimizer)
@@ -169,6 +190,21 @@ def best_optima(
             "record for jumps of many orders of magnitude, or try fewer pairs."
         )
     return optima
+
+
+def linear_starts(
+    model: Model, records: Sequence[PreparedRecord], count: int | None, seed: int
+) -> list[Values]:
+    """Starts of a linear model: of subspace identification and with random poles, in turn.
+
+    Args:
+        model: the model. records: to which it is fitted. seed: of random poles.
+        count: how many; None for all orders of subspace identification and `RANDOM` others.
+    """
+    subspace = subspace_starts(model, records, seed)
+    random = starting_values(model, records, count=count or RANDOM, seed=seed)
+    both = [one for pair in zip_longest(subspace, random) for one in pair if one is not None]
+    return both[:count]
 
 
 def at_optimum(model: Model, optima: Sequence[Optimum], seed: int, records: Records) -> Fitted:

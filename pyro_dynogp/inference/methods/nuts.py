@@ -71,7 +71,8 @@ class Nuts:
         check_optimizer(self.optimizer)
 
     def check(self, model: Model, *, warm: bool) -> None:
-        """Every model can be sampled."""
+        """Every model can be sampled; not every optimizer finds its mode."""
+        check_optimizer(self.optimizer, model)
 
     @property
     def identity(self) -> object:

@@ -90,7 +90,8 @@ class Normal:
         check_optimizer(self.optimizer)
 
     def check(self, model: Model, *, warm: bool) -> None:
-        """Refuse "map" for a model in which nothing would be free."""
+        """Refuse "map" for a model in which nothing would be free, and unsuitable optimizers."""
+        check_optimizer(self.optimizer, model)
         if self.family == "map" and not model.has_function and not model.collapsed.state_sites:
             raise invalid(
                 "hyperparameters",

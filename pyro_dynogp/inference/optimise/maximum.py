@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.optimise import gauss_newton
 from pyro_dynogp.inference.optimise.descent import descend, lbfgs
 from pyro_dynogp.inference.optimise.lockstep import Functions, in_lockstep
 from pyro_dynogp.inference.run import Run
@@ -22,12 +23,16 @@ from pyro_dynogp.support.parallel import parallel_map, seeded
 
 # End, energies on the way, why it ended.
 Climb = tuple[np.ndarray, list[float], str]
-Optimizer = Literal["lbfgs", "preconditioned", "adam"]
+Optimizer = Literal["gauss-newton", "lbfgs", "preconditioned", "adam"]
 # Adam's first step, and how often it goes back to the best point with a shorter one.
 RATE, RETURNS = 0.02, 2
 # Starts that climb together, as long as they have no more samples than this in all: longer records
 # keep a processor busy one by one.
 TOGETHER, BATCH_SAMPLES = 4, 8000
+
+
+# Iterations of Gauss-Newton that tell promising starts from others, and how many go on at least.
+FEW, SEVERAL = 5, 3
 
 
 @dataclass(frozen=True)
@@ -146,20 +151,27 @@ def _optimise(task: _Task) -> list[Optimum]:
 def _climb(task: _Task) -> list[Optimum]:
     with seeded(task.run.seed):
         potential = Potential(task.model, (task.records,), task.starts[0])
-        method = _METHODS[task.optimizer]
-        every = potential.hessian_cost  # of a climb, Hessians are at most half the work
-
-        def run(start: dict[str, Tensor]) -> Callable[[Functions], Climb]:
-            z = potential.pack(start).numpy()
-            return lambda functions: method(functions, z, task, every)
-
-        found = in_lockstep(potential.values_and_gradients, [run(start) for start in task.starts])
+        found = _climbs(potential, task)
         ends = np.stack([z for z, _, _ in found])
         energies = potential.values_and_gradients(ends)[0]
         return [
             Optimum(float(energy), _values(potential, z), np.asarray(history), message)
             for energy, (z, history, message) in zip(energies, found, strict=True)
         ]
+
+
+def _climbs(potential: Potential, task: _Task) -> list[Climb]:
+    starts = [potential.pack(start).numpy() for start in task.starts]
+    if task.optimizer == "gauss-newton":
+        innovations = gauss_newton.Innovations(potential)
+        return [gauss_newton.climb(innovations, z, task.steps) for z in starts]
+    method = _METHODS[task.optimizer]
+    every = potential.hessian_cost  # of a climb, Hessians are at most half the work
+
+    def run(z: np.ndarray) -> Callable[[Functions], Climb]:
+        return lambda functions: method(functions, z, task, every)
+
+    return in_lockstep(potential.values_and_gradients, [run(z) for z in starts])
 
 
 def _values(potential: Potential, z: np.ndarray) -> dict[str, Tensor]:
@@ -215,10 +227,12 @@ def maximise(
     """Climb from every start; the optima sorted by energy, best first.
 
     All starts get a fifth of the steps, then the best of them the rest (successive halving: a start
-    that is far behind by then hardly ever wins). The mode is that of the density of the constrained
-    values (no Jacobian), as AutoDelta has it. The result does not depend on the number of
-    processors.
+    that is far behind by then hardly ever wins); by Gauss-Newton there is a stage of a few steps
+    before. The mode is that of the density of the constrained values (no Jacobian), as AutoDelta
+    has it. The result does not depend on the number of processors.
     """
+    # Gauss-Newton evaluates several points by itself.
+    together = 1 if optimizer == "gauss-newton" else effort.together
 
     def climb(values: Sequence[dict[str, Tensor]], count: int, label: str) -> list[Optimum]:
         tasks = [
@@ -233,7 +247,7 @@ def maximise(
                 effort.rate,
                 effort.near or label == "optima",
             )
-            for i, batch in enumerate(_batches(values, model, records, effort.together))
+            for i, batch in enumerate(_batches(values, model, records, together))
         ]
         found = parallel_map(
             _optimise,
@@ -250,15 +264,28 @@ def maximise(
 
     if len(starts) == 1:
         return climb(starts, steps, "optimum")
-    short = max(1, steps // 5)
-    first = best_first(climb(starts, short, "starts"))
-    if steps <= short:
-        return first
-    cut = max(1, round(effort.kept * len(first)))
-    leading = first[:cut]
-    further = climb([optimum.values for optimum in leading], steps - short, "optima")
-    joined = [
-        replace(after, history=np.concatenate([before.history, after.history]))
-        for before, after in zip(leading, further, strict=True)
-    ]
-    return best_first([*joined, *first[cut:]])
+    behind: list[Optimum] = []
+    leading = best_first(climb(starts, *next(rungs := iter(_rungs(optimizer, steps)))))
+    for count, label in rungs:
+        least = SEVERAL if optimizer == "gauss-newton" and label == "starts" else 1
+        cut = max(least, round(effort.kept * len(leading)))
+        leading, behind = leading[:cut], behind + leading[cut:]
+        further = climb([optimum.values for optimum in leading], count, label)
+        leading = best_first([
+            replace(after, history=np.concatenate([before.history, after.history]))
+            for before, after in zip(leading, further, strict=True)
+        ])  # fmt: skip
+    return best_first([*leading, *behind])
+
+
+def _rungs(optimizer: Optimizer, steps: int) -> list[tuple[int, str]]:
+    """Steps of each stage, which only the best of the stage before take, and its name."""
+    first = [FEW] if optimizer == "gauss-newton" else []
+    ends = [*first, max(1, steps // 5), steps]
+    names = [*(["candidates"] if first else []), "starts", "optima"]
+    before, rungs = 0, []
+    for end, name in zip(ends, names, strict=True):
+        if end > before:
+            rungs.append((end - before, name))
+            before = end
+    return rungs
