@@ -96,9 +96,7 @@ def _factored(
 ) -> tuple[Tensor, Tensor | None, SemiseparableCovariance]:
     """Departures (*b, N), zero where missing; where that is; covariance of the samples."""
     residual, missing = split_missing(observed.rows(y - observed.mean))
-    v = observed.noise_rows
-    v = v if missing is None else v.masked_fill(missing, torch.inf)
-    return residual, missing, observed.covariance(v)
+    return residual, missing, observed.covariance(observed.noise, missing)
 
 
 def _moments(
