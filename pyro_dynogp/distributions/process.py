@@ -129,9 +129,8 @@ class LTIProcess(Trajectory):
         self, noise_variance: Tensor, missing: Tensor | None = None
     ) -> SemiseparableCovariance:
         """Covariance of the trajectory plus independent noise; see `Trajectory`."""
-        return SemiseparableCovariance(
-            self.modes, self.grid, noise_variance, self.initial_covariance, missing
-        )
+        P0 = self.initial_covariance
+        return SemiseparableCovariance(self.modes, self.grid, noise_variance, P0, missing)
 
     @property
     def noise(self) -> Tensor:  # type: ignore[override]
@@ -273,8 +272,7 @@ class ConditionedLTIProcess(Trajectory):
     def _jittered(self) -> SemiseparableCovariance:
         """Covariance of the samples under the prior with jitter, which can be drawn from."""
         if self._with_jitter is None:
-            v = self.noise_rows + self.prior.noise_rows
-            self._with_jitter = self.prior.covariance(v)
+            self._with_jitter = self.prior.covariance(self.noise_rows + self.prior.noise_rows)
         return self._with_jitter
 
     @property

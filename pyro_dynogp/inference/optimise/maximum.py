@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -31,8 +32,9 @@ RATE, RETURNS = 0.02, 2
 TOGETHER, BATCH_SAMPLES = 4, 8000
 
 
-# Iterations of Gauss-Newton that tell promising starts from others, and how many go on at least.
-FEW, SEVERAL = 5, 3
+# Iterations of Gauss-Newton after which starts are ranked, and the share of them that goes on:
+# those from subspace identification rise first, others may end higher.
+RANKED = ((5, 0.75), (15, 0.5), (30, 0.5))
 
 
 @dataclass(frozen=True)
@@ -227,9 +229,9 @@ def maximise(
     """Climb from every start; the optima sorted by energy, best first.
 
     All starts get a fifth of the steps, then the best of them the rest (successive halving: a start
-    that is far behind by then hardly ever wins); by Gauss-Newton there is a stage of a few steps
-    before. The mode is that of the density of the constrained values (no Jacobian), as AutoDelta
-    has it. The result does not depend on the number of processors.
+    that is far behind by then hardly ever wins); by Gauss-Newton in the stages of `RANKED`. The
+    mode is that of the density of the constrained values (no Jacobian), as AutoDelta has it. The
+    result does not depend on the number of processors.
     """
     # Gauss-Newton evaluates several points by itself.
     together = 1 if optimizer == "gauss-newton" else effort.together
@@ -245,7 +247,7 @@ def maximise(
                 run,
                 f"{key}-{label}-{i}",
                 effort.rate,
-                effort.near or label == "optima",
+                effort.near or label.startswith("optima"),
             )
             for i, batch in enumerate(_batches(values, model, records, together))
         ]
@@ -265,27 +267,24 @@ def maximise(
     if len(starts) == 1:
         return climb(starts, steps, "optimum")
     behind: list[Optimum] = []
-    leading = best_first(climb(starts, *next(rungs := iter(_rungs(optimizer, steps)))))
-    for count, label in rungs:
-        least = SEVERAL if optimizer == "gauss-newton" and label == "starts" else 1
-        cut = max(least, round(effort.kept * len(leading)))
+    (first, _), *further = _stages(optimizer, steps, effort.kept)
+    leading = best_first(climb(starts, first, "starts"))
+    for stage, (count, kept) in enumerate(further):
+        cut = max(1, math.ceil(kept * len(leading) - 0.5))
         leading, behind = leading[:cut], behind + leading[cut:]
-        further = climb([optimum.values for optimum in leading], count, label)
+        label = "optima" if stage == 0 else f"optima-{stage}"
+        goes_on = climb([optimum.values for optimum in leading], count, label)
         leading = best_first([
             replace(after, history=np.concatenate([before.history, after.history]))
-            for before, after in zip(leading, further, strict=True)
+            for before, after in zip(leading, goes_on, strict=True)
         ])  # fmt: skip
     return best_first([*leading, *behind])
 
 
-def _rungs(optimizer: Optimizer, steps: int) -> list[tuple[int, str]]:
-    """Steps of each stage, which only the best of the stage before take, and its name."""
-    first = [FEW] if optimizer == "gauss-newton" else []
-    ends = [*first, max(1, steps // 5), steps]
-    names = [*(["candidates"] if first else []), "starts", "optima"]
-    before, rungs = 0, []
-    for end, name in zip(ends, names, strict=True):
-        if end > before:
-            rungs.append((end - before, name))
-            before = end
-    return rungs
+def _stages(optimizer: Optimizer, steps: int, kept: float) -> list[tuple[int, float]]:
+    """Steps of each stage, and the share of the starts that takes them, all of them at first."""
+    ranked = RANKED if optimizer == "gauss-newton" else ((max(1, steps // 5), kept),)
+    ends = [min(end, steps) for end, _ in ranked] + [steps]
+    shares = [1.0, *(max(kept, share) for _, share in ranked)]
+    counts = np.diff([0, *ends]).tolist()
+    return [(count, share) for count, share in zip(counts, shares, strict=True) if count]
