@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 from types import MappingProxyType
 from typing import Any, get_args
 
@@ -26,6 +27,7 @@ from pyro_dynogp.inference.starts.plans import (
     starting_point,
 )
 from pyro_dynogp.inference.starts.poles import grown, starting_values
+from pyro_dynogp.inference.starts.subspace import subspace_starts
 from pyro_dynogp.layers.noise import TYPICAL
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.variants import without_noise_below_functions
@@ -37,11 +39,11 @@ from pyro_dynogp.support.parallel import seeded
 
 # Most iterations of linear fits by each optimizer.
 STEPS: Mapping[str, int] = MappingProxyType(
-    {"gauss-newton": 100, "lbfgs": 500, "preconditioned": 500, "adam": 1500}
+    {"gauss-newton": 60, "lbfgs": 500, "preconditioned": 500, "adam": 1500}
 )
-# Starts and iterations of the linear fits that come first.
-LINEAR_STARTS = 6
-LINEAR_STEPS = 60
+# Starts of linear fits with random poles; iterations of those that come before cascades.
+RANDOM = 6
+LINEAR_STEPS = 40
 # Measurement noise, in sds of the outputs, from which starts without process noise climb at least.
 UNEXPLAINED = 0.5
 
@@ -69,7 +71,7 @@ def starting_points(
             found = maximise(
                 twin,
                 training if len(training) > 1 else training[0],
-                starting_values(twin, training, count=LINEAR_STARTS, seed=seed),
+                linear_starts(twin, training, None, seed),
                 optimizer=optimizer_for(twin),
                 steps=min(LINEAR_STEPS, steps),
                 seed=seed,
@@ -173,19 +175,19 @@ def best_optima(
     """
     model, records, learnt = problem.model, problem.records, problem.learnt
     optimizer = optimizer or optimizer_for(model)
-    restarts = run.restarts or (8 if model.has_function else 6)
     options: dict[str, Any] = {
         "optimizer": optimizer, "seed": run.seed, "workers": run.workers,
         "progress": run.progress, "checkpoints": run.checkpoints,
     }  # fmt: skip
     if model.is_linear:
-        starts = starting_values(model, records, count=restarts, seed=run.seed)
+        starts = linear_starts(model, records, run.restarts, run.seed)
         if learnt is not None:
             starts = [grown(learnt, starts[0]), *starts]
         steps = steps or STEPS[optimizer]
         optima = maximise(problem.target, problem.argument, starts, steps=steps, **options)
     else:
         steps = steps or 600
+        restarts = run.restarts or (8 if model.has_function else RANDOM)
         starts = starting_points(
             problem.target, records, restarts, steps, run.seed, run.workers, run.progress,
             run.checkpoints,
@@ -198,6 +200,21 @@ def best_optima(
             "record for jumps of many orders of magnitude, or try fewer pairs."
         )
     return optima
+
+
+def linear_starts(
+    model: Model, records: Sequence[Record], count: int | None, seed: int
+) -> list[Values]:
+    """Starts of a linear model: of subspace identification and with random poles, in turn.
+
+    Args:
+        model: with its scaling. records: prepared with its channels. seed: of random poles.
+        count: how many; None for all orders of subspace identification and `RANDOM` others.
+    """
+    subspace = subspace_starts(model, records, seed)
+    random = starting_values(model, records, count=count or RANDOM, seed=seed)
+    both = [one for pair in zip_longest(subspace, random) for one in pair if one is not None]
+    return both[:count]
 
 
 def at_optimum(

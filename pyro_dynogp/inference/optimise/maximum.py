@@ -34,6 +34,10 @@ RATE, RETURNS = 0.02, 2
 TOGETHER, BATCH_SAMPLES = 4, 8000
 
 
+# Iterations of Gauss-Newton that tell promising starts from others.
+FEW = 5
+
+
 @dataclass(frozen=True)
 class Effort:
     """How starts share the work.
@@ -236,7 +240,8 @@ def maximise(
     """Climb from every start; the optima sorted by energy, best first.
 
     All starts get a fifth of the steps, then the best of them the rest (successive halving: a start
-    that is far behind by then hardly ever wins). The mode is that of the density of the constrained
+    that is far behind by then hardly ever wins); by Gauss-Newton there is a stage of a few steps
+    before. The mode is that of the density of the constrained
     values (no Jacobian), as AutoDelta has it. The result does not depend on the number of
     processors.
     """
@@ -274,15 +279,27 @@ def maximise(
 
     if len(starts) == 1:
         return climb(starts, steps, "optimum")
-    short = max(1, steps // 5)
-    first = best_first(climb(starts, short, "starts"))
-    if steps <= short:
-        return first
-    cut = max(1, round(effort.kept * len(first)))
-    leading = first[:cut]
-    further = climb([optimum.values for optimum in leading], steps - short, "optima")
-    joined = [
-        replace(after, history=np.concatenate([before.history, after.history]))
-        for before, after in zip(leading, further, strict=True)
-    ]
-    return best_first([*joined, *first[cut:]])
+    behind: list[Optimum] = []
+    leading = best_first(climb(starts, *next(rungs := iter(_rungs(optimizer, steps)))))
+    for count, label in rungs:
+        cut = max(1, round(effort.kept * len(leading)))
+        leading, behind = leading[:cut], behind + leading[cut:]
+        further = climb([optimum.values for optimum in leading], count, label)
+        leading = best_first([
+            replace(after, history=np.concatenate([before.history, after.history]))
+            for before, after in zip(leading, further, strict=True)
+        ])  # fmt: skip
+    return best_first([*leading, *behind])
+
+
+def _rungs(optimizer: Optimizer, steps: int) -> list[tuple[int, str]]:
+    """Steps of each stage, which only the best of the stage before take, and its name."""
+    first = [FEW] if optimizer == "gauss-newton" else []
+    ends = [*first, max(1, steps // 5), steps]
+    names = [*(["candidates"] if first else []), "starts", "optima"]
+    before, rungs = 0, []
+    for end, name in zip(ends, names, strict=True):
+        if end > before:
+            rungs.append((end - before, name))
+            before = end
+    return rungs
