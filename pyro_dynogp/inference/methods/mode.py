@@ -39,7 +39,7 @@ from pyro_dynogp.support.parallel import seeded
 
 # Most iterations of linear fits by each optimizer.
 STEPS: Mapping[str, int] = MappingProxyType(
-    {"gauss-newton": 60, "lbfgs": 500, "preconditioned": 500, "adam": 1500}
+    {"gauss-newton": 100, "lbfgs": 500, "preconditioned": 500, "adam": 1500}
 )
 # Starts of linear fits with random poles; iterations of those that come before cascades.
 RANDOM = 6
