@@ -208,11 +208,11 @@ def fit(
         start: a fit to start from beside the restarts: of the same model to other data, or of a
             model that this one extends (what sites have in common is taken over).
         seed: the same seed gives the same numbers to the last bit on one machine.
-        restarts: number of starting points (default 6; 8 with static layers; 2 of
-            `Trajectories`).
-        steps: most iterations of a start (default 500; Adam 1500; cascades 600) and, with "svi", of
-            SVI (default 1000; with static layers 60, and no more while hyperparameters stay at the
-            optimum, around which it begins all but normal).
+        restarts: number of starting points (default 8 with static layers; 2 of `Trajectories`; else
+            6 with random poles and, on equal steps, up to 6 of subspace identification).
+        steps: most iterations of a start (default 100 of Gauss-Newton; 500 of L-BFGS; Adam 1500;
+            cascades 600) and, with "svi", of SVI (default 1000; with static layers 60, and no more
+            while hyperparameters stay at the optimum, around which it begins all but normal).
         checkpoint: a folder that keeps finished pieces of the work. The same call continues from
             there after a kill, and ends in the same bits.
         workers: processes; None for all processors, 1 for none but this one.

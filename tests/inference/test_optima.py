@@ -20,7 +20,7 @@ from tests.inference.cascades import FAST, wiener
 
 @pytest.fixture(scope="module")
 def several(bent):
-    options = {**FAST, "restarts": 6, "steps": 60, "draws": 400}
+    options = {**FAST, "restarts": 8, "steps": 60, "draws": 400}
     return dgp.fit(wiener(), bent, **options)
 
 

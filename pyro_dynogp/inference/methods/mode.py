@@ -41,7 +41,7 @@ from pyro_dynogp.support.parallel import seeded
 STEPS: Mapping[str, int] = MappingProxyType(
     {"gauss-newton": 100, "lbfgs": 500, "preconditioned": 500, "adam": 1500}
 )
-# Starts of linear fits with random poles; iterations of those that come before cascades.
+# Most starts of linear fits of each kind; iterations of those that come before cascades.
 RANDOM = 6
 LINEAR_STEPS = 40
 # Measurement noise, in sds of the outputs, from which starts without process noise climb at least.
@@ -199,9 +199,9 @@ def linear_starts(
 
     Args:
         model: the model. records: to which it is fitted. seed: of random poles.
-        count: how many; None for all orders of subspace identification and `RANDOM` others.
+        count: how many; None for `RANDOM` of each kind, as far as there are orders.
     """
-    subspace = subspace_starts(model, records, seed)
+    subspace = subspace_starts(model, records, seed)[:RANDOM]
     random = starting_values(model, records, count=count or RANDOM, seed=seed)
     both = [one for pair in zip_longest(subspace, random) for one in pair if one is not None]
     return both[:count]
