@@ -25,7 +25,6 @@ if TYPE_CHECKING:  # the same names, for editors and type checkers; a test compa
     )
     from pyro_dynogp.data.record import Record as Record
     from pyro_dynogp.data.scaling import Scaling as Scaling
-    from pyro_dynogp.discrepancy.settings import LoopSettings as LoopSettings
     from pyro_dynogp.distributions.process import LTIProcess as LTIProcess
     from pyro_dynogp.distributions.reparam import InnovationReparam as InnovationReparam
     from pyro_dynogp.examples import datasets as datasets
@@ -65,6 +64,7 @@ if TYPE_CHECKING:  # the same names, for editors and type checkers; a test compa
     from pyro_dynogp.prediction.prediction import Prediction as Prediction
     from pyro_dynogp.prediction.scores import scores as scores
     from pyro_dynogp.report.loop import close_loop as close_loop
+    from pyro_dynogp.statistics.settings import LoopSettings as LoopSettings
 
 # Where each public name is defined. They are imported when they are first used (PEP 562), so that
 # the command line answers at once.
@@ -107,7 +107,7 @@ HOMES = {
     "simulation_based_calibration": "criticism.simulation_based",
     "from_pyro": "criticism.from_pyro",
     "close_loop": "report.loop",
-    "LoopSettings": "discrepancy.settings",
+    "LoopSettings": "statistics.settings",
     # Parts of a Pyro model of one's own.
     "LTIProcess": "distributions.process",
     "Modes": "lti.modes",

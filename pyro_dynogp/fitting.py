@@ -13,7 +13,9 @@ from pyro_dynogp.criticism import inference_data
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference import storage
 from pyro_dynogp.inference.fitted import Fitted
-from pyro_dynogp.inference.methods.base import Method
+from pyro_dynogp.inference.methods.base import Method, Problem
+from pyro_dynogp.inference.methods.choose import method_of
+from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.summary import summary
 from pyro_dynogp.inference.training import train_model
 from pyro_dynogp.models.model import Model
@@ -54,11 +56,11 @@ class Fit(Fitted):
 
     def log_likelihood(self, records: Record | Sequence[Record]) -> np.ndarray:
         """Log p(y | draw) (S,) [nats], exact marginal likelihood in the units of the record."""
-        total: Any = 0.0
+        total = torch.zeros((), dtype=torch.float64)
         with torch.no_grad():
-            for record in self.model.check(records):
-                outputs = output_process(beginning(self, record), self.scaling, record)
-                total = total + outputs.log_prob(record.tensors().observations)
+            for record in self.model.prepare(records):
+                outputs = output_process(beginning(self, record), record)
+                total = total + outputs.log_prob(record.observations)
         return total.numpy()
 
     def simulate(
@@ -206,11 +208,11 @@ def fit(
         start: a fit to start from beside the restarts: of the same model to other data, or of a
             model that this one extends (what sites have in common is taken over).
         seed: the same seed gives the same numbers to the last bit on one machine.
-        restarts: number of starting points (default 6; 8 with static layers; 2 of
-            `Trajectories`).
-        steps: most iterations of a start (default 500; Adam 1500; cascades 600) and, with "svi", of
-            SVI (default 1000; with static layers 60, and no more while hyperparameters stay at the
-            optimum, around which it begins all but normal).
+        restarts: number of starting points (default 8 with static layers; 2 of `Trajectories`; else
+            6 with random poles and, on equal steps, up to 6 of subspace identification).
+        steps: most iterations of a start (default 100 of Gauss-Newton; 500 of L-BFGS; Adam 1500;
+            cascades 600) and, with "svi", of SVI (default 1000; with static layers 60, and no more
+            while hyperparameters stay at the optimum, around which it begins all but normal).
         checkpoint: a folder that keeps finished pieces of the work. The same call continues from
             there after a kill, and ends in the same bits.
         workers: processes; None for all processors, 1 for none but this one.
@@ -223,13 +225,11 @@ def fit(
         ValueError: on channels that do not fit the model, constant or entirely missing outputs,
             unknown options or such that the method does not use, or where no start leads anywhere.
     """
-    return Fit.of(
-        train_model(
-            model, record, method=method, options=options, start=start, seed=seed,
-            restarts=restarts, steps=steps, checkpoint=checkpoint, workers=workers,
-            progress=progress,
-        )
-    )  # fmt: skip
+    chosen = method_of(method, model, options)
+    run = Run(seed, workers, progress, restarts=restarts, steps=steps)
+    chosen.check(model, warm=start is not None)
+    problem = Problem.of(model, record, start)
+    return Fit.of(train_model(problem, chosen, run, checkpoint))
 
 
 def load(path: str | Path) -> Fit:

@@ -18,9 +18,7 @@ PACKAGE = "pyro_dynogp"
 # Arrows that run upwards today, each with its reason. An arrow that is gone has to leave the list.
 UPWARD: dict[tuple[str, str], str] = {}
 # Arrows that close a circle inside one room.
-WITHIN = {
-    ("models.checks", "models.model"): "the type of a model alone",
-}
+WITHIN: dict[tuple[str, str], str] = {}
 
 
 def contract():

@@ -10,10 +10,12 @@ LINES_OF_A_FILE = 330
 LINES_OF_A_FUNCTION = 80  # its docstring not counted
 ARGUMENTS = 12
 LINES = 31_500
-LINES_TODAY = 36_600  # the package of the version before had 34 928; to shrink, and to go
+# The package of two versions before had 34 928; kernels in lanes, the density without tracing, and
+# Gauss-Newton came since (1900 lines). To shrink, and to go.
+LINES_TODAY = 38_400
 
 # What is larger today; what has shrunk has to leave the list.
-LARGE_FILES = {"models/model.py", "models/priors.py"}
+LARGE_FILES: set[str] = set()
 LONG_FUNCTIONS: set[str] = set()
 MANY_ARGUMENTS: set[str] = set()
 

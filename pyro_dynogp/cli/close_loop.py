@@ -66,12 +66,11 @@ def close_loop(
     """  # noqa: D301
     record, left_out = whole_record(data, columns, candidates)
     import pyro_dynogp as dgp
-    from pyro_dynogp.discrepancy.settings import DEFAULTS
 
-    if len(record) < 4 * DEFAULTS.block_samples:
-        raise InvalidInput(
-            f"{data}: has {len(record)} samples; {4 * DEFAULTS.block_samples} are needed."
-        )
+    settings = dgp.LoopSettings()
+    fewest = 4 * settings.block_samples
+    if len(record) < fewest:
+        raise InvalidInput(f"{data}: has {len(record)} samples; {fewest} are needed.")
     out.mkdir(parents=True, exist_ok=True)
     if left_out:
         click.echo(f"Left out, as they hold no numbers: {', '.join(left_out)}", err=True)

@@ -40,28 +40,28 @@ class Check:
     @property
     def good(self) -> bool:
         """Whether nothing speaks against the fit."""
-        return all(one.good is not False for one in self.findings)
+        return all(finding.good is not False for finding in self.findings)
 
     @property
     def verdict(self) -> str:
         """One sentence."""
-        bad = [one.name for one in self.findings if one.good is False]
+        bad = [finding.name for finding in self.findings if finding.good is False]
         if not bad:
             return "Nothing that was looked at speaks against this fit."
         return f"Look again at: {', '.join(bad)}."
 
     def __getitem__(self, name: str) -> Finding:
-        for one in self.findings:
-            if one.name == name:
-                return one
+        for finding in self.findings:
+            if finding.name == name:
+                return finding
         raise KeyError(name)
 
     def __str__(self) -> str:
         mark = {True: "good", False: "BAD", None: ""}
-        width = max(len(one.name) for one in self.findings)
+        width = max(len(finding.name) for finding in self.findings)
         lines = [
-            f"{one.name:<{width}}  {mark[one.good]:<4}  {one.number:>8}  {one.text}"
-            for one in self.findings
+            f"{finding.name:<{width}}  {mark[finding.good]:<4}  {finding.number:>8}  {finding.text}"
+            for finding in self.findings
         ]
         return "\n".join([f"Check of a fit by {self.method}", *lines, self.verdict])
 

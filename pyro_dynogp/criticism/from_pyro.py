@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -20,6 +20,7 @@ from pyro_dynogp.criticism.pyro_draws import (
 )
 from pyro_dynogp.criticism.pyro_posterior import PyroPosterior
 from pyro_dynogp.criticism.site_densities import is_masked, is_trajectory
+from pyro_dynogp.layers.sites import Arguments, Program
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.parallel import seeded
 
@@ -27,9 +28,9 @@ __all__ = ["PyroPosterior", "from_pyro"]
 
 
 def from_pyro(
-    model: Callable[..., Any],
+    model: Program,
     posterior: Any,
-    *args: Any,
+    *args: object,
     observed: Mapping[str, Any] | None = None,
     draws: int = 400,
     coords: Mapping[str, Any] | None = None,
@@ -101,9 +102,7 @@ def from_pyro(
     )
 
 
-def _at(
-    model: Callable[..., Any], args: tuple[Any, ...], values: Mapping[str, Tensor], s: int
-) -> Nodes:
+def _at(model: Program, args: Arguments, values: Mapping[str, Tensor], s: int) -> Nodes:
     """Sample sites of the model at one draw, with their densities."""
     known = pyro.poutine.Trace()
     for name, value in values.items():

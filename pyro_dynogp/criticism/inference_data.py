@@ -260,11 +260,12 @@ def prior_draws(fit: Fitted, count: int, seed: int) -> tuple[dict[str, Tensor], 
 
 def one_step_densities(fit: Fitted, record: Record) -> np.ndarray:
     """Log-density (S, n, n_y) [nats] of each output given those before it, at each draw."""
+    (along,) = fit.model.prepare(record)
 
     def observed(some: Fitted) -> OutputProcess:
-        return output_process(beginning(some, record), some.scaling, record)
+        return output_process(beginning(some, along), along)
 
-    return densities_at(fit, fit.draws, record, observed, "forecast")
+    return densities_at(fit, fit.draws, along, observed, "forecast")
 
 
 def _inputs_of(record: Record, suffix: str) -> Variable:

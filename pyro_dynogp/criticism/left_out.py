@@ -18,7 +18,7 @@ from scipy.special import logsumexp
 from tqdm import trange
 
 from pyro_dynogp.criticism import arviz_bridge
-from pyro_dynogp.criticism.subjects import Subject
+from pyro_dynogp.criticism.subjects import FitSubject, Subject
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.parallel import parallel_map
 
@@ -149,7 +149,9 @@ def forecast(
     """Forwards through the record: ratios take in what came since the last fit, until a refit.
 
     Draws given less data are wider than what they stand for, and have not seen what is forecast.
-    Where no refit is allowed, ratios take the future out of the draws given all data instead.
+    Around the mode of a model without static functions there is one fit, to the past of the first
+    forecast; later its draws are moved on to more data. Where no refit is allowed, ratios take the
+    future out of the draws given all data instead.
     """
     places = subject.places
     if len(np.unique(places["record"])) > 1:
@@ -178,9 +180,10 @@ def forecast(
         found.elpd = target[0, scored]
         return found
     good = arviz_bridge.good_k(len(whole))
-    shares: list[np.ndarray] = []  # influences on forecasts since the last refit
+    shares: list[np.ndarray] = []  # influences on forecasts of the draws since the last fit
     errors: list[float] = []
     current = base
+    past: Subject | None = None
     end = len(sample)  # data before this one are in the current fit
     for place in trange(len(scored), desc="forecasts", disable=not progress):
         i = int(scored[place])
@@ -188,10 +191,14 @@ def forecast(
         known = i if horizon == 1 else int(np.searchsorted(sample, sample[i] - horizon + 1))
         log_weights, k = _given(current, step, known, end)
         if found.refits < most and (k > good or end > known):
-            if shares:  # other draws from here on
-                errors.append(spread_of(np.sum(shares, axis=0), current.ancestor))
-                shares = []
-            past = subject.without(np.arange(len(sample)) >= known)
+            left_out = np.arange(len(sample)) >= known
+            if isinstance(past, FitSubject) and past.carries:
+                past = past.carried(left_out)
+            else:
+                if shares:  # other draws from here on
+                    errors.append(spread_of(np.sum(shares, axis=0), None))
+                    shares = []
+                past = subject.without(left_out)
             step, target = _both(past, horizon)
             current, end = Base.of(past), known
             found.refits += 1
@@ -200,8 +207,11 @@ def forecast(
             found.left += 1
         found.k[place] = k
         found.elpd[place] = logsumexp(log_weights + target[:, i])
-        shares.append(np.exp(log_weights + target[:, i] - found.elpd[place]) - np.exp(log_weights))
-    errors.append(spread_of(np.sum(shares, axis=0), current.ancestor))
+        share = np.exp(log_weights + target[:, i] - found.elpd[place]) - np.exp(log_weights)
+        if current.ancestor is not None:
+            share = np.bincount(current.ancestor, share, len(share))
+        shares.append(share)
+    errors.append(spread_of(np.sum(shares, axis=0), None))
     found.error = float(np.sqrt(np.square(errors).sum()))
     return found
 

@@ -63,8 +63,10 @@ def loo(
             long that parameters are all but known.
         refits: most fits that are made again where Pareto's k is above ArviZ's good_k. Forecasts
             begin with a fit to the past of the first one, and go on from it by ratios that take in
-            what came since; 0 has them take the future out of the draws given all data instead,
-            which flatters. "new record" makes one for each fold whatever this says.
+            what came since. Where these fail the draws around a mode of a model without static
+            functions are moved to more data, which counts as a refit; 0 has them take the future
+            out of the draws given all data instead, which flatters. "new record" makes one for each
+            fold whatever this says.
         seed: for the draws. workers: processes for refits. progress: whether to show a bar.
 
     Returns:

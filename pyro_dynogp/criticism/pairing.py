@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.records import one_record
 from pyro_dynogp.prediction.prediction import Prediction
 from pyro_dynogp.support.errors import invalid
 
@@ -80,13 +81,7 @@ def _check_types(prediction: Prediction, record: Record) -> None:
             got=type(prediction).__name__,
             advice="Make one with fit.predict, fit.simulate or fit.forecast.",
         )
-    if not isinstance(record, Record):
-        raise invalid(
-            "record",
-            expected="one Record",
-            got=type(record).__name__,
-            advice="Compare several records one after the other.",
-        )
+    one_record(record, "Compare several records one after the other.")
 
 
 def _check_times(prediction: Prediction, record: Record) -> None:

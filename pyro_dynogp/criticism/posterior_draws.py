@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyro
@@ -16,9 +16,12 @@ from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.finding import apart
 from pyro_dynogp.criticism.kept_draws import kept
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.inference.density import Potential, log_prob_by_draw
+from pyro_dynogp.inference.cascade_coordinates import StraightPotential
+from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.log_joint import log_prob_by_draw
 from pyro_dynogp.inference.methods import annealed as annealing
 from pyro_dynogp.inference.posteriors import Draws, Mixture
+from pyro_dynogp.layers.sites import Arguments, Program
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
@@ -30,9 +33,6 @@ if TYPE_CHECKING:
 Values = Mapping[str, Tensor]
 # Draws that `check` and `loo` take where they are not told: the same, so that their k agree.
 DRAWS = 1000
-# Widest standard deviation of a Laplace approximation, in unconstrained units, where the density
-# is flat: priors are about as wide.
-WIDEST = 1.5
 # Samples times draws that are evaluated at once.
 AT_ONCE = 4_000_000
 
@@ -87,8 +87,9 @@ def draws_of(
     NUTS: its draws. A variational posterior: fresh draws of it; of a cascade by default those of
     inducing values and first states, with all else at an optimum, whose own uncertainty then
     counts nowhere. A posterior mode: Laplace's approximation around it. Where Pareto's k says that
-    a normal does not describe the posterior of a linear model, particles are annealed from it to
-    the posterior itself (`inference.annealing`).
+    a normal does not describe the posterior of a linear model, another one is taken that is normal
+    in coordinates without bent ridges (`inference.cascade_coordinates`); where that does not
+    either, particles are annealed from it to the posterior itself (`inference.methods.annealed`).
 
     Args:
         fit: the fit. count: number of draws S (of NUTS all there are). seed: for them.
@@ -140,8 +141,8 @@ def judged(fit: Fitted, draws: Draws, kind: str | None = None) -> PosteriorDraws
 def laplace(fit: Fitted, values: Values) -> Mixture:
     """Normal around an optimum, from the Hessian of the log joint density there."""
     with seeded(fit.seed):
-        potential = Potential(fit.model.collapsed, (_argument(fit.records),), values)
-        centre, root = potential.laplace(values, widest=WIDEST)
+        potential = Potential(fit.model.collapsed, (fit.model.prepare(fit.records),), values)
+        centre, root = potential.laplace(values)
     return Mixture.normal(potential, torch.as_tensor(centre), torch.as_tensor(root))
 
 
@@ -167,31 +168,75 @@ def _annealed(
             advice="Fit with method='svi' (the default of cascades) or 'nuts', or use "
             "parameters='mode'.",
         )
-    normal = normal_of(fit)
-    z, start = annealing.around(normal, count, seed)
-    target = annealing.Joint(fit.model.collapsed, (_argument(fit.records),), normal.sites)
     with seeded(seed):
-        annealed = annealing.anneal(z, start, target, seed=seed, progress=progress)
-        values = FrozenMapping(normal.at_latent(annealed.z))
+        prepared = (fit.model.prepare(fit.records),)
+        potential = StraightPotential(fit.model.collapsed, prepared, fit.mode)
+        loc, root = map(torch.as_tensor, potential.laplace(fit.mode))
+        z, start = annealing.around(loc, root, count, seed)
+        target = annealing.Joint(potential, _samples(fit.records))
+        ratio = (target(z)[0] - start(z)[0]).numpy()
+        straight = float(arviz_bridge.psis(ratio)[1]) <= arviz_bridge.good_k(count)
+        found = None
+        if not straight:
+            found = annealing.anneal(z, start, target, seed=seed, progress=progress)
+            z = found.z
+        with torch.no_grad():
+            values = FrozenMapping(potential.unpack(z))
+    log_p = log_joint(fit, values)
+    way = "annealed" if found else "a Student-t in straight coordinates"
     return PosteriorDraws(
         values,
-        log_joint(fit, values),
-        None,
+        log_p,
+        None if found else log_p - ratio,
         np.zeros(count, dtype=int),
-        f"annealed from {own.kind}, whose own Pareto k is {shape}",
-        annealed.ancestor,
+        f"{way} from {own.kind}, whose own Pareto k is {shape}",
+        found.ancestor if found else None,
     )
+
+
+def carried(
+    old: Fitted, draws: PosteriorDraws, new: Fitted, *, seed: int, progress: bool = False
+) -> PosteriorDraws:
+    """Draws of a posterior moved to that given other data, without a fit (Chopin 2002).
+
+    Particles are annealed from the one to the other; draws of another density are resampled by
+    their ratios first.
+
+    Args:
+        old: a fit without static functions. draws: of its posterior.
+        new: the same with other records. seed: of the moves. progress: whether to show a bar.
+    """
+    data = (old.model.prepare(old.records),)
+    before = StraightPotential(old.model.collapsed, data, old.mode)
+    after = before.on((new.model.prepare(new.records),))
+    start, target = (
+        annealing.Joint(potential, _samples(fit.records))
+        for potential, fit in ((before, old), (after, new))
+    )
+    count = len(draws)
+    generator = np.random.default_rng(seed)
+    weight = np.exp(arviz_bridge.psis(draws.log_ratio)[0])
+    first = np.searchsorted(np.cumsum(weight), (np.arange(count) + generator.random()) / count)
+    first = np.minimum(first, count - 1)
+    z = before.pack(draws.values)[first]
+    found = annealing.anneal(z, start, target, seed=seed, progress=progress)
+    with torch.no_grad():
+        values = FrozenMapping(after.unpack(found.z))
+    roots = np.arange(count) if draws.ancestor is None else draws.ancestor
+    kind = "annealed from draws given other data"
+    group = np.zeros(count, dtype=int)
+    return PosteriorDraws(values, None, None, group, kind, roots[first[found.ancestor]])
 
 
 def log_joint(fit: Fitted, values: Values) -> np.ndarray:
     """Log p(y, values) (S,) of draws, y the training records; -inf where it has no value."""
     return log_joint_of(
-        fit.model.collapsed, (_argument(fit.records),), values, _samples(fit.records)
+        fit.model.collapsed, (fit.model.prepare(fit.records),), values, _samples(fit.records)
     )
 
 
 def log_joint_of(
-    model: Any, args: tuple[Any, ...], values: Values, samples: int = 1000
+    model: Program, args: Arguments, values: Values, samples: int = 1000
 ) -> np.ndarray:
     """Log-density (S,) of a Pyro model at S draws of its latent sites, those of the data included.
 
@@ -206,7 +251,7 @@ def log_joint_of(
     return np.concatenate(parts)
 
 
-def _portion(model: Any, args: tuple[Any, ...], values: Values) -> np.ndarray:
+def _portion(model: Program, args: Arguments, values: Values) -> np.ndarray:
     count = len(next(iter(values.values())))
     try:
         with torch.no_grad(), pyro.validation_enabled(False):
@@ -230,10 +275,6 @@ def _portion(model: Any, args: tuple[Any, ...], values: Values) -> np.ndarray:
             raise invalid("values", expected=f"draws of every site, {name!r} too", got="none of it")
     total = log_prob_by_draw(trace, count).numpy()
     return np.where(np.isfinite(total), total, -np.inf)
-
-
-def _argument(records: Sequence[Record]) -> Any:
-    return records[0] if len(records) == 1 else tuple(records)
 
 
 def _samples(records: Sequence[Record]) -> int:

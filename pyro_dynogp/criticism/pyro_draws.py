@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,13 +12,14 @@ from torch import Tensor
 
 from pyro_dynogp.criticism.posterior_draws import PosteriorDraws
 from pyro_dynogp.inference.posteriors import Mixture, Sampled
+from pyro_dynogp.layers.sites import Arguments, Program
 from pyro_dynogp.support.errors import invalid
 
 Nodes = dict[str, Any]
 
 
 def draws_of_any(
-    model: Callable[..., Any], posterior: Any, args: tuple[Any, ...], count: int
+    model: Program, posterior: Any, args: Arguments, count: int
 ) -> tuple[PosteriorDraws, int]:
     """Draws (S) of a posterior, without log_p, and the number of chains they make up.
 
@@ -46,7 +47,7 @@ def draws_of_any(
     return _of_guide(posterior, args, count), 1
 
 
-def _of_guide(guide: Any, args: tuple[Any, ...], count: int) -> PosteriorDraws:
+def _of_guide(guide: Program, args: Arguments, count: int) -> PosteriorDraws:
     drawn: list[dict[str, Tensor]] = []
     log_q = np.zeros(count)
     for s in range(count):
@@ -106,9 +107,7 @@ def deterministic_nodes(nodes: Nodes) -> Nodes:
     return {name: node for name, node in nodes.items() if node["infer"].get("_deterministic")}
 
 
-def _leading(
-    model: Callable[..., Any], samples: Mapping[str, Tensor], args: tuple[Any, ...]
-) -> dict[str, int]:
+def _leading(model: Program, samples: Mapping[str, Tensor], args: Arguments) -> dict[str, int]:
     """How many leading dimensions each site has: (S) or (chain, draw)."""
     trace = pyro.poutine.trace(model).get_trace(*args)
     sites = latent_nodes(sample_nodes(trace, "model"))

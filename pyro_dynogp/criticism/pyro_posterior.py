@@ -90,10 +90,10 @@ class PyroPosterior:
                     advice="They have seen the sample that they would have to predict.",
                 )
             found = [
-                integrated_density(one, value, kind, horizon)
-                if self.trajectories or is_integrated(one)  # which refuses what factorises
-                else elementwise_density(one, value).numpy()
-                for one in self.sites[name]
+                integrated_density(distribution, value, kind, horizon)
+                if self.trajectories or is_integrated(distribution)  # which refuses what factorises
+                else elementwise_density(distribution, value).numpy()
+                for distribution in self.sites[name]
             ]
             there = measured(self.sites[name][0], value).reshape(-1).numpy()
             parts.append(np.stack(found).reshape(len(found), -1)[:, there])
@@ -148,7 +148,7 @@ class PyroPosterior:
         posterior = {k: self._variable(k, v.numpy(), v.shape[1:]) for k, v in kept.items()}
         with seeded(self.seed), torch.no_grad():
             replicated = {
-                name: torch.stack([one.sample() for one in each]).numpy()
+                name: torch.stack([distribution.sample() for distribution in each]).numpy()
                 for name, each in self.sites.items()
             }
         predictive = {k: self._variable(k, v, v.shape[1:]) for k, v in replicated.items()}
@@ -185,10 +185,10 @@ class PyroPosterior:
         for name, value in self.observed.items():
             integrated = is_integrated(self.sites[name][0])
             each = [
-                integrated_density(one, value, "forecast").reshape(value.shape)
+                integrated_density(distribution, value, "forecast").reshape(value.shape)
                 if integrated
-                else elementwise_density(one, value).numpy()
-                for one in self.sites[name]
+                else elementwise_density(distribution, value).numpy()
+                for distribution in self.sites[name]
             ]
             values = np.stack(each)
             dims = self._variable(name, value.numpy(), value.shape).dims[: values.ndim - 1]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,6 +15,10 @@ from pyro_dynogp.criticism.posterior_draws import draws_of, log_joint
 from pyro_dynogp.criticism.rank_results import SimulationBasedCalibration, judged
 from pyro_dynogp.criticism.ranks import rank_of
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.records import one_record
+from pyro_dynogp.inference.methods.base import Method, Problem
+from pyro_dynogp.inference.methods.choose import method_of
+from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.training import train_model
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.support.errors import invalid
@@ -27,15 +30,6 @@ if TYPE_CHECKING:
 JOINT = "log joint"
 # NUTS draws so many times as many as are kept, so that those are nearly independent.
 THIN = 5
-# Arguments of `fit` that every method takes.
-SHARED = ("start", "restarts", "steps", "checkpoint")
-
-
-class _Fixed(Model):
-    """A model that keeps its scaling, and with it its prior, whatever it is fitted to."""
-
-    def scaled_to(self, records: Record | Sequence[Record]) -> Model:
-        return self
 
 
 @dataclass(frozen=True)
@@ -43,17 +37,18 @@ class _Task:
     """One replicate.
 
     Attributes:
-        model: that keeps its scaling. blank: record without outputs. missing: (n, n_y) gaps.
-        method: of `fit`. draws: L. seed: for all of it. options: of `fit`.
+        model: whose scaling states the prior. blank: record without outputs.
+        missing: (n, n_y) gaps. method: of inference. draws: L.
+        run: of the fit; its seed is for all of it. learnt: what it may start from.
     """
 
     model: Model
     blank: Record
     missing: np.ndarray
-    method: Literal["map", "svi", "nuts"]
+    method: Method
     draws: int
-    seed: int
-    options: Mapping[str, Any]
+    run: Run
+    learnt: Mapping[str, Tensor] | None
 
 
 @dataclass(frozen=True)
@@ -113,12 +108,12 @@ def simulation_based_calibration(
             cannot have here; where no replicate could be fitted.
     """
     _check(model, record, method, replicates, draws, level, fit_options)
-    fixed = _Fixed(**{f.name: getattr(model, f.name) for f in dataclasses.fields(model) if f.init})
     model.check(record)
     blank = record.with_outputs(np.empty((len(record), 0)), names=(), units=())
     gaps = record.missing if record.n_outputs else np.zeros((len(record), model.outputs), bool)
+    chosen, run, learnt = _method(model, method, draws, fit_options)
     tasks = [
-        _Task(fixed, blank, gaps, method, draws, child, fit_options)
+        _Task(model, blank, gaps, chosen, draws, replace(run, seed=child), learnt)
         for child in child_seeds(seed, replicates)
     ]
     outcomes = parallel_map(
@@ -127,17 +122,17 @@ def simulation_based_calibration(
         workers=workers,
         progress=progress,
         description="simulation-based calibration",
-        news=lambda done: f"{sum(bool(one.failure) for one in done)} failed",
+        news=lambda done: f"{sum(bool(outcome.failure) for outcome in done)} failed",
     )
-    good = [one for one in outcomes if not one.failure]
-    failures = tuple(one.failure for one in outcomes if one.failure)
+    good = [outcome for outcome in outcomes if not outcome.failure]
+    failures = tuple(outcome.failure for outcome in outcomes if outcome.failure)
     if not good:
         raise invalid(
             "model", expected="a prior to whose data fits can be made",
             got=f"{replicates} replicates that all failed, the first with: {failures[0]}",
         )  # fmt: skip
-    ranks = {name: np.array([one.ranks[name] for one in good]) for name in good[0].ranks}
-    few = sum(one.effective < draws for one in good)
+    ranks = {name: np.array([outcome.ranks[name] for outcome in good]) for name in good[0].ranks}
+    few = sum(outcome.effective < draws for outcome in good)
     notes = []
     if few:
         notes.append(
@@ -149,7 +144,13 @@ def simulation_based_calibration(
 
 
 def _check(
-    model: Any, record: Any, method: Any, replicates: Any, draws: Any, level: Any, options: Any
+    model: object,
+    record: object,
+    method: object,
+    replicates: object,
+    draws: object,
+    level: object,
+    options: Mapping[str, Any],
 ) -> None:
     if not isinstance(model, Model):
         raise invalid("model", expected="a LinearDynamicGP or a Cascade", got=type(model).__name__)
@@ -162,8 +163,7 @@ def _check(
         raise invalid(
             "model", expected="priors that can be drawn from", got="priors='paper', which are flat"
         )
-    if not isinstance(record, Record):
-        raise invalid("record", expected="one Record", got=type(record).__name__)
+    one_record(record, "Calibrate one after the other.")
     if method not in ("map", "svi", "nuts"):
         raise invalid("method", expected="'map', 'svi' or 'nuts'", got=repr(method))
     for name, value, least in (("replicates", replicates, 2), ("draws", draws, 9)):
@@ -190,7 +190,7 @@ def _replicate(task: _Task) -> _Outcome:
 
 def _simulated(task: _Task) -> tuple[dict[str, Tensor], Record]:
     """Values of all sites from the prior, and a record of what the model makes of them."""
-    with seeded(task.seed), torch.no_grad(), pyro.poutine.block():
+    with seeded(task.run.seed), torch.no_grad(), pyro.poutine.block():
         trace = pyro.poutine.trace(task.model).get_trace(task.blank)
     sites = {name: node["value"] for name, node in trace.nodes.items() if node["type"] == "sample"}
     y = sites.pop("y").numpy().reshape(task.missing.shape)
@@ -203,23 +203,30 @@ def _simulated(task: _Task) -> tuple[dict[str, Tensor], Record]:
     return sites, task.blank.with_outputs(y, names=names, units=units)
 
 
+def _method(
+    model: Model, name: Literal["map", "svi", "nuts"], draws: int, options: Mapping[str, Any]
+) -> tuple[Method, Run, Mapping[str, Tensor] | None]:
+    """The method that gives so many draws, what its runs share, and values that it starts from."""
+    loose = dict(options)
+    run = Run(workers=1, restarts=loose.pop("restarts", None), steps=loose.pop("steps", None))
+    start = loose.pop("start", None)
+    if name == "nuts":
+        loose["draws"] = -(-THIN * draws // loose.get("chains", 4))
+    elif name == "svi":
+        loose["draws"] = draws
+    chosen = method_of(name, model, loose)
+    chosen.check(model, warm=start is not None)
+    return chosen, run, None if start is None else dict(start.mode)
+
+
 def _fitted(task: _Task, record: Record) -> Fitted:
-    options: dict[str, Any] = dict(task.options)
-    if task.method == "nuts":
-        chains = options.get("chains", 4)
-        options["draws"] = -(-THIN * task.draws // chains)
-    elif task.method == "svi":
-        options["draws"] = task.draws
-    loose = {name: options.pop(name) for name in list(options) if name not in SHARED}
-    return train_model(
-        task.model, record, method=task.method, options=loose, seed=task.seed, workers=1,
-        progress=False, **options,
-    )  # fmt: skip
+    problem = Problem(task.model, task.model.prepare(record), task.learnt)
+    return train_model(problem, task.method, task.run)
 
 
 def _ranked(task: _Task, truth: Mapping[str, Tensor], fitted: Fitted) -> _Outcome:
-    generator = np.random.default_rng(task.seed)
-    own = draws_of(fitted, count=task.draws, seed=task.seed, anneal=False)
+    generator = np.random.default_rng(task.run.seed)
+    own = draws_of(fitted, count=task.draws, seed=task.run.seed, anneal=False)
     known = {name: truth[name].unsqueeze(0) for name in own.values}
     log_p = log_joint(fitted, own.values) if own.log_p is None else own.log_p
     kept = np.linspace(0, len(own) - 1, task.draws).round().astype(int)

@@ -16,12 +16,14 @@ from pyro_dynogp.criticism.posterior_draws import (
     AT_ONCE,
     PosteriorDraws,
     Values,
+    carried,
     draws_of,
 )
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.refit import refit
 from pyro_dynogp.models.output_process import OutputProcess
 from pyro_dynogp.models.outputs import output_process
+from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
@@ -65,6 +67,7 @@ class FitSubject:
         records: where densities are evaluated. count, seed: of the draws.
         parameters: "posterior", or "mode" for the mode alone.
         progress: whether drawing shows a bar where it takes long.
+        drawn: draws of the posterior, where they did not come from the fit.
     """
 
     fit: Fitted
@@ -73,10 +76,13 @@ class FitSubject:
     seed: int
     parameters: Parameters = "posterior"
     progress: bool = False
+    drawn: PosteriorDraws | None = None
 
     @property
     def draws(self) -> PosteriorDraws:
         """Draws (S) of the posterior, kept with the fit, or the mode as the only one."""
+        if self.drawn is not None:
+            return self.drawn
         if self.parameters == "mode":
             values = {name: value.unsqueeze(0) for name, value in self.fit.mode.items()}
             return PosteriorDraws(values, None, None, np.zeros(1, dtype=int), "at the mode")
@@ -111,15 +117,32 @@ class FitSubject:
 
     def _along(self, record: Record, index: int | None, kind: Kind, horizon: int) -> np.ndarray:
         """Densities of a record's measured samples."""
+        along = PreparedRecord.of(record, self.fit.scaling)
 
         def observed(part: Fitted) -> OutputProcess:
-            return observed_of(part, record, index)
+            return observed_of(part, along, index)
 
-        found = densities_at(self.fit, self.draws.values, record, observed, kind, horizon)
+        found = densities_at(self.fit, self.draws.values, along, observed, kind, horizon)
         return found[:, ~record.missing]
 
     def without(self, left_out: np.ndarray) -> FitSubject:
         """The same model fitted without some samples (N,)."""
+        fit = refit(self.fit, self._rest(left_out))
+        return replace(self, fit=fit, progress=False, drawn=None)
+
+    @property
+    def carries(self) -> bool:
+        """Whether draws can be moved to other data without a fit, as `carried` does."""
+        known = self.parameters == "mode" or self.fit.model.has_function
+        return self.fit.method == "map" and not known
+
+    def carried(self, left_out: np.ndarray) -> FitSubject:
+        """As `without`, by these draws moved to the posterior given those data."""
+        fit = replace(self.fit, records=tuple(self._rest(left_out)))
+        return replace(self, fit=fit, drawn=carried(self.fit, self.draws, fit, seed=self.seed))
+
+    def _rest(self, left_out: np.ndarray) -> list[Record]:
+        """The records without some samples (N,)."""
         rest = []
         for index, record in enumerate(self.records):
             own = self.places["record"] == index
@@ -131,13 +154,13 @@ class FitSubject:
             rest.append(record.with_outputs(y)[: max(there[-1] + 1 if len(there) else 0, 2)])
         if all(one.missing.all() for one in rest):
             raise invalid("record", expected="samples left to fit to", got="none")
-        return replace(self, fit=refit(self.fit, rest), progress=False)
+        return rest
 
 
 def densities_at(
     fit: Fitted,
     values: Values,
-    record: Record,
+    record: PreparedRecord,
     observed: Callable[[Fitted], OutputProcess],
     kind: Kind,
     horizon: int = 1,
@@ -149,18 +172,19 @@ def densities_at(
         observed: distribution of the outputs, of the fit with some of the draws.
         kind, horizon: see `pointwise_log_density`.
     """
-    y = record.tensors().observations
     count = len(next(iter(values.values())))
-    portion = max(1, AT_ONCE // (len(record) * record.n_outputs))
+    portion = max(1, AT_ONCE // record.observations.numel())
     parts = []
     for first in range(0, count, portion):
         some = fit.with_draws({k: v[first : first + portion] for k, v in values.items()})
         with torch.no_grad():
-            parts.append(pointwise_log_density(observed(some), y, kind, horizon=horizon))
+            parts.append(
+                pointwise_log_density(observed(some), record.observations, kind, horizon=horizon)
+            )
     return np.concatenate(parts)
 
 
-def observed_of(fit: Fitted, record: Record, index: int | None) -> OutputProcess:
+def observed_of(fit: Fitted, record: PreparedRecord, index: int | None) -> OutputProcess:
     """Distribution of a record's outputs for each draw of a fit.
 
     Args:
@@ -172,7 +196,7 @@ def observed_of(fit: Fitted, record: Record, index: int | None) -> OutputProcess
     if index is not None:
         suffix = "" if len(fit.records) == 1 else f"_{index}"
         states = fit.model.states_of(fit.draws, suffix)
-    return output_process(fit.model.begin(fit.system, states), fit.scaling, record)
+    return output_process(fit.model.begin(fit.system, states), record)
 
 
 @dataclass(frozen=True, eq=False)

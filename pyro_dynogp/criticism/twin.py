@@ -17,6 +17,7 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.methods.nuts import Chains, sample_posterior
 from pyro_dynogp.inference.refit import refit
+from pyro_dynogp.inference.run import Run
 from pyro_dynogp.prediction.predict import predict
 from pyro_dynogp.support.errors import invalid
 
@@ -80,23 +81,21 @@ def twin_findings(
     effort = effort or Effort()
     small = refit(fit, _first(fit, samples))
     target = small.model.collapsed
-    argument = small.records[0] if len(small.records) == 1 else small.records
+    records = small.model.prepare(small.records)
     values = {name: value.detach() for name, value in small.mode.items()}
     chains = sample_posterior(
         target,
-        argument,
+        records,
         values,
+        Run(seed, workers, progress),
         chains=effort.chains,
         draws=effort.draws,
         warmup=effort.warmup,
-        seed=seed,
-        workers=workers,
-        progress=progress,
     )
     drawn = {name: x.flatten(0, 1) for name, x in chains.draws.items()}
     settled = _settled(small, drawn, effort)
     own = draws_of(small, seed=seed, anneal=False)
-    potential = Potential(target, (argument,), values)
+    potential = Potential(target, (records,), values)
     sites, left = _sites(potential, own.values, chains)
     predictions = _predictions(small, drawn)
     known = bool(settled <= UNSETTLED)

@@ -8,6 +8,18 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.support.errors import invalid
 
 
+def one_record(record: object, advice: str) -> Record:
+    """A single record.
+
+    Raises:
+        ValueError: where it is anything else; `advice` says what to do with several.
+    """
+    if not isinstance(record, Record):
+        got = type(record).__name__
+        raise invalid("record", expected="one Record", got=got, advice=advice)
+    return record
+
+
 def as_records(records: Record | Sequence[Record]) -> tuple[Record, ...]:
     """One record or several experiments on the same system, as a tuple of records.
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.data_faults import Fault, faults, without_stuck
-from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
 from pyro_dynogp.prediction.records import gap_between, joined
+from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ class Blocks:
 
 
 def blocks_of(
-    fit: Fit, record: Record, candidates: Record | None, settings: LoopSettings = DEFAULTS
+    fit: Fit, record: Record, candidates: Record | None, settings: LoopSettings
 ) -> Blocks:
     """Cut the data in time.
 
@@ -114,7 +114,7 @@ def blocks_of(
     return Blocks(cleared[:second], held_out, cleared[second:], refit, sentence, tuple(found))
 
 
-def shared(held_out: np.ndarray, stretches: int = DEFAULTS.stretches) -> np.ndarray:
+def shared(held_out: np.ndarray, stretches: int) -> np.ndarray:
     """Every other stretch of the block that is searched (n,), the last one among them.
 
     The rest of it is for the fit, where something happens that only that block shows.

@@ -16,7 +16,6 @@ from pyro_dynogp.discrepancy.decision import Confirmed, certain, confirm
 from pyro_dynogp.discrepancy.refits import quick_fit
 from pyro_dynogp.discrepancy.residuals import residuals_of
 from pyro_dynogp.discrepancy.search import Found, look, rated
-from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
 from pyro_dynogp.discrepancy.trials import forecast_density, forecast_errors, without
 from pyro_dynogp.effects import Effect
 from pyro_dynogp.models.variants import (
@@ -26,6 +25,7 @@ from pyro_dynogp.models.variants import (
 )
 from pyro_dynogp.statistics.evidence import Residuals
 from pyro_dynogp.statistics.omnibus import Beyond, beyond_catalogue, structure_left
+from pyro_dynogp.statistics.settings import LoopSettings
 
 if TYPE_CHECKING:
     from pyro_dynogp.fitting import Fit
@@ -79,7 +79,7 @@ class SearchContext:
     effects: Sequence[Effect]
     workers: int | None
     progress: bool
-    settings: LoopSettings = DEFAULTS
+    settings: LoopSettings
     held_out: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
@@ -132,7 +132,12 @@ class SearchContext:
         found, notes = [], []
         for where, some in ((whole, of_inputs), (residuals, others)):
             seen, skipped = look(
-                where, some, seed=self.seed, workers=self.workers, progress=self.progress
+                where,
+                some,
+                self.settings,
+                seed=self.seed,
+                workers=self.workers,
+                progress=self.progress,
             )
             found += [(one.effect, one.evidence) for one in seen]
             notes += skipped
@@ -190,7 +195,7 @@ class SearchContext:
 
         Gains are zero there, and so is what is fitted.
         """
-        tests = [beyond_catalogue(one, seed=self.seed) for one in residuals]
+        tests = [beyond_catalogue(one, self.settings, self.seed) for one in residuals]
         return [
             one if one.p_value * len(tests) <= self.gate
             else Beyond(one.p_value, 0.0, np.zeros_like(one.fitted))
@@ -218,7 +223,7 @@ class SearchContext:
             for one, other in zip(residuals, beyond, strict=True)
         ]
         # From the channel it was found in.
-        found, _ = look(rest, [winner.effect], seed=self.seed, workers=1)
+        found, _ = look(rest, [winner.effect], self.settings, seed=self.seed, workers=1)
         channel = winner.evidence.where.get("channel")
         again = [f.evidence for f in found if f.evidence.where.get("channel") == channel]
         return all(one.p_value > self.level for one in again)
@@ -246,7 +251,7 @@ class SearchContext:
             rates = ", ".join(f"{name} ({q:.2g})" for name, q in named.items())
             return (f"Residual tests speak for (false discovery rate): {rates}.",)
         omnibus = [
-            structure_left(one, other, seed=self.seed)
+            structure_left(one, self.settings, self.level, plain=other, seed=self.seed)
             for one, other in zip(looked.residuals, looked.whole, strict=True)
         ]
         return tuple(said for p, said in omnibus if p * len(omnibus) <= self.gate)

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.statistics.detecting import unit
 from pyro_dynogp.statistics.evidence import Residuals
+from pyro_dynogp.statistics.pictures import unit
+from pyro_dynogp.statistics.settings import LoopSettings
 
 # A run of equal values is suspect where chance makes as long a one in one record of a thousand,
 # and it is so many times as long as nearly all others.
@@ -67,14 +68,14 @@ def without_stuck(record: Record, found: Iterable[Fault]) -> Record:
     return record.with_outputs(outputs)
 
 
-def data_spikes(residuals: Residuals) -> Fault | None:
+def data_spikes(residuals: Residuals, settings: LoopSettings) -> Fault | None:
     """Single samples that leave both neighbours while those agree."""
     r = residuals
     x = r.residual
     off = x[1:-1] - 0.5 * (x[2:] + x[:-2])
     apart = np.abs(x[2:] - x[:-2])
     known = np.isfinite(off)
-    if known.sum() < 30:
+    if known.sum() < settings.measured_samples:
         return None
     sd = 1.4826 * float(np.median(np.abs(off[known])))
     if sd <= 0:

@@ -13,10 +13,10 @@ from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.result import Attempt
 from pyro_dynogp.discrepancy.search import Candidate, Found
-from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
 from pyro_dynogp.discrepancy.trials import Score, Trial, Tried, interleaved, run
 from pyro_dynogp.fitting import Fit
 from pyro_dynogp.models.variants import Model
+from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.support.parallel import parallel_map
 
 # Where densities are scored: after the training data, or on blocks spread over the whole record.
@@ -89,9 +89,8 @@ class _Refits:
         spread = interleaved(len(self.record), self.settings.folds)
         folds = spread if where == "spread" else (self.held_out,)
         plain = Trial(
-            models, self.record, folds, self.current, self.seed, score, fit=known,
-            settings=self.settings,
-        )  # fmt: skip
+            models, self.record, folds, self.current, self.seed, self.settings, score, fit=known
+        )
         if found is None:
             return plain
         return replace(plain, refine=found.effect.refine, compared=found.effect.compared)
@@ -149,7 +148,7 @@ def confirm(
     number: int,
     seed: int,
     level: float,
-    settings: LoopSettings = DEFAULTS,
+    settings: LoopSettings,
     workers: int | None = None,
     progress: bool = False,
 ) -> Confirmed:
@@ -236,7 +235,7 @@ def _judge(
     tried: Tried,
     base: Tried,
     number: int,
-    settings: LoopSettings = DEFAULTS,
+    settings: LoopSettings,
 ) -> _Judged:
     """A candidate against the model without it."""
     evidence, q = found.evidence, found.q_value
@@ -261,7 +260,7 @@ def _judge(
     return _Judged(found, kind, tried, attempt, helps)
 
 
-def certain(gains: np.ndarray, settings: LoopSettings = DEFAULTS) -> bool:
+def certain(gains: np.ndarray, settings: LoopSettings) -> bool:
     """Whether gains (N,) of single samples are certainly more than nothing in all."""
     error = settings.standard_errors * block_standard_error(gains)[0]
     return bool(gains.sum() > max(settings.gain, error))
@@ -313,7 +312,7 @@ def _best(judged: Sequence[_Judged]) -> _Judged:
     return max(judged, key=lambda one: one.attempt.gain)
 
 
-def _ties(one: _Judged, best: _Judged, settings: LoopSettings = DEFAULTS) -> bool:
+def _ties(one: _Judged, best: _Judged, settings: LoopSettings) -> bool:
     """Whether two candidates explain held-out data equally well, within two standard errors.
 
     A special case of the best one need not gain quite as much: what is left of it are differences

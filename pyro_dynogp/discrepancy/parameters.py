@@ -128,7 +128,7 @@ def _numbers(fit: Fit, group: Sequence[Channel], record: Record) -> Parameters:
         )
         model = replace(fit.model, channels=channels, scaling=scaling).collapsed
         # Channels are made once here, not in every evaluation.
-        return Potential(model, model.check(record), fit.mode)
+        return Potential(model, (model.prepare(record),), fit.mode)
 
     found = number_posterior(potential, numbers)
     whose = " and ".join(one.channel for one in group if hasattr(one, "channel"))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -11,11 +10,13 @@ import torch
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.fitting import Fit
 from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.mode import at_optimum, climb, grow, starting_points
 from pyro_dynogp.inference.optimise.descent import descend
 from pyro_dynogp.inference.optimise.lockstep import Functions
 from pyro_dynogp.inference.optimise.maximum import Effort, Optimum, maximise
 from pyro_dynogp.inference.optimise.side_by_side import each_in_lockstep
+from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.dynamic import Values
 from pyro_dynogp.inference.starts.poles import (
     grown,
@@ -25,7 +26,7 @@ from pyro_dynogp.inference.starts.poles import (
 )
 from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.support.checkpoints import NOTHING_KEPT
+from pyro_dynogp.models.prepared import PreparedRecord
 
 # Iterations and fresh starts beside the warm one, of linear models and of cascades.
 LINEAR_STEPS, LINEAR_STARTS = 120, 2
@@ -41,7 +42,7 @@ LEADING, FEWEST = 1 / 5, 3
 
 
 # A linear model in the units of its records, and where it may start.
-_Beginning = tuple[Model, tuple[Record, ...], list[Values]]
+_Beginning = tuple[Model, tuple[PreparedRecord, ...], list[Values]]
 
 
 def quick_fit(
@@ -107,7 +108,8 @@ def race(
     begun = [one for one in found[:cut] if _begins(one.model, base)]
     rest = [one for one in found if not any(one is other for other in begun)]
     further = [_further(one, seed) for one in begun if not one.model.is_linear]
-    more = [(one.model, one.records, [dict(one.mode)]) for one in begun if one.model.is_linear]
+    more = [(one.model, one.model.prepare(one.records), [dict(one.mode)])
+            for one in begun if one.model.is_linear]  # fmt: skip
     further += _side_by_side(more, MORE_STEPS, seed)
     return sorted([*further, *rest], key=energy), problems
 
@@ -126,13 +128,13 @@ def poles_of(fit: Fit) -> np.ndarray | None:
     return poles
 
 
-def _scaled(model: Model, record: Record) -> tuple[Model, tuple[Record, ...]]:
-    """The model in the units of a record, and the record with the model's channels.
+def _scaled(model: Model, record: Record) -> tuple[Model, tuple[PreparedRecord, ...]]:
+    """The model in the units of a record, and the record as it sees it.
 
     Outputs count where the model knows its inputs.
     """
-    records = model.check(where_inputs_are_known(record, longest_delay(model)))
-    return replace(model, scaling=None).scaled_to(records), records
+    problem = Problem.of(model, where_inputs_are_known(record, longest_delay(model)))
+    return problem.model, problem.records
 
 
 def _begins(model: Model, base: Fit) -> bool:
@@ -147,8 +149,7 @@ def _side_by_side(beginnings: Sequence[_Beginning], steps: int, seed: int) -> li
     together at each step.
     """
     potentials = [
-        Potential(model.collapsed, (records[0],), starts[0])
-        for model, records, starts in beginnings
+        Potential(model.collapsed, (records,), starts[0]) for model, records, starts in beginnings
     ]
 
     def run(potential: Potential, starts: Sequence[Values]) -> Callable[[Functions], Optimum]:
@@ -175,28 +176,29 @@ def _side_by_side(beginnings: Sequence[_Beginning], steps: int, seed: int) -> li
 def _further(found: Fit, seed: int) -> Fit:
     """More steps of a cascade's climb that has begun."""
     optima = maximise(
-        found.model.collapsed, found.records[0], [dict(found.mode)], optimizer="preconditioned",
-        steps=MORE_STEPS, seed=seed, workers=1, effort=Effort(near=True),
+        found.model.collapsed, found.model.prepare(found.records), [dict(found.mode)],
+        Run(seed, workers=1), optimizer="preconditioned", steps=MORE_STEPS,
+        effort=Effort(near=True),
     )  # fmt: skip
     return Fit.of(at_optimum(found.model, optima, seed, found.records))
 
 
 def _linear(
     model: Model,
-    records: Sequence[Record],
+    records: Sequence[PreparedRecord],
     starts: Sequence[Values],
     steps: int,
     seed: int,
 ) -> list[Optimum]:
     return maximise(
-        model.collapsed, records[0], starts, optimizer="preconditioned", steps=steps, seed=seed,
-        workers=1, effort=Effort(together=TOGETHER, kept=KEPT),
+        model.collapsed, records, starts, Run(seed, workers=1), optimizer="preconditioned",
+        steps=steps, effort=Effort(together=TOGETHER, kept=KEPT),
     )  # fmt: skip
 
 
 def _warm_starts(
     model: Model,
-    records: Sequence[Record],
+    records: Sequence[PreparedRecord],
     seed: int,
     base: Fit | None,
     poles: np.ndarray | None = None,
@@ -221,23 +223,23 @@ def _warm_starts(
     return starts
 
 
-def _fresh(model: Model, records: Sequence[Record], seed: int) -> list[Optimum]:
+def _fresh(model: Model, records: Sequence[PreparedRecord], seed: int) -> list[Optimum]:
     """Without a function a cascade starts at its optimum but for the noise: one start is enough."""
     count = CASCADE_STARTS if model.has_function else 1
-    target = model.collapsed
-    starts = starting_points(target, records, count, LINEAR_STEPS, seed, 1, False, NOTHING_KEPT)
+    target, run = model.collapsed, Run(seed, workers=1)
+    starts = starting_points(target, records, run, count=count, steps=LINEAR_STEPS)
     return climb(
-        target, records[0], starts, [], optimizer="adam", steps=CASCADE_STEPS, seed=seed,
-        workers=1, effort=Effort(together=TOGETHER),
+        target, records, starts, [], run, optimizer="adam", steps=CASCADE_STEPS,
+        effort=Effort(together=TOGETHER),
     )  # fmt: skip
 
 
 def _grown(
-    model: Model, records: Sequence[Record], seed: int, base: Fit, steps: int, filling: int
+    model: Model, records: Sequence[PreparedRecord], seed: int, base: Fit, steps: int, filling: int
 ) -> list[Optimum]:
     """From what a cascade of the same layers has learnt; what it lacks is filled and silent."""
-    target = model.collapsed
-    (start,) = starting_points(target, records, 1, filling, seed, 1, False, NOTHING_KEPT)
+    target, run = model.collapsed, Run(seed, workers=1)
+    (start,) = starting_points(target, records, run, count=1, steps=filling)
     assert model.scaling is not None
     learnt = grown(base.mode, start, model.all_sites(model.scaling, len(records)))
-    return grow(target, records[0], learnt, start, steps=steps, seed=seed)
+    return grow(target, records, learnt, start, run, steps=steps)

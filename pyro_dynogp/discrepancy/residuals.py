@@ -10,10 +10,10 @@ import numpy as np
 from pyro_dynogp.criticism.posterior_draws import draws_of
 from pyro_dynogp.data.channels import count_direct
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
 from pyro_dynogp.models.delays import longest_delay, unknown_beginning
 from pyro_dynogp.models.limits import at_limits
 from pyro_dynogp.statistics.evidence import Residuals
+from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def residuals_of(
     candidates: Sequence[str] = (),
     output: int = 0,
     seed: int = 0,
-    settings: LoopSettings = DEFAULTS,
+    settings: LoopSettings,
 ) -> Residuals:
     """Simulation residuals and innovations of one output, in the units of the record.
 
@@ -88,7 +88,7 @@ def residuals_of(
     )
 
 
-def settling(fit: Fit, record: Record, settings: LoopSettings = DEFAULTS) -> int:
+def settling(fit: Fit, record: Record, settings: LoopSettings) -> int:
     """Samples until what the first state left in a simulation has died away."""
     modes = [layer.modes for _, layer in fit.system_at(fit.mode).dynamic]
     if not modes:

@@ -9,10 +9,10 @@ import numpy as np
 from scipy.stats import false_discovery_control
 
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
 from pyro_dynogp.effects import Effect
 from pyro_dynogp.models.variants import Model
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
+from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.support.parallel import parallel_map
 
 
@@ -33,13 +33,14 @@ Candidate = tuple[Found, tuple[Model, ...]]
 class _Look:
     effect: Effect
     residuals: Residuals
+    settings: LoopSettings
     seed: int
 
 
 def _look(task: _Look) -> list[Evidence] | str:
     """Evidence, or why the residual cannot be tested for the effect."""
     try:
-        return list(task.effect.detect(task.residuals, seed=task.seed))
+        return list(task.effect.detect(task.residuals, task.settings, seed=task.seed))
     except ValueError as error:
         return str(error)
 
@@ -47,6 +48,7 @@ def _look(task: _Look) -> list[Evidence] | str:
 def look(
     residuals: Sequence[Residuals],
     effects: Sequence[Effect],
+    settings: LoopSettings,
     *,
     seed: int,
     workers: int | None = None,
@@ -59,7 +61,7 @@ def look(
     Each is paid for: p-values are multiplied by the number of outputs, and q-values are those of
     Benjamini and Yekutieli (2001), which hold however the tests depend on each other.
     """
-    tasks = [_Look(effect, one, seed) for one in residuals for effect in effects]
+    tasks = [_Look(effect, one, settings, seed) for one in residuals for effect in effects]
     looked = parallel_map(
         _look, tasks, workers=workers, progress=progress, description="residual tests"
     )
@@ -95,7 +97,7 @@ def candidates_of(
     record: Record,
     level: float,
     tries: int,
-    settings: LoopSettings = DEFAULTS,
+    settings: LoopSettings,
 ) -> list[Candidate]:
     """The most probable effects that can be added, best first.
 

@@ -17,6 +17,7 @@ from pyro_dynogp.discrepancy.trials import without
 from pyro_dynogp.effects.base import OUTSIDE
 from pyro_dynogp.models.variants import Model, has_process_noise
 from pyro_dynogp.statistics.evidence import Residuals
+from pyro_dynogp.statistics.settings import LoopSettings
 
 if TYPE_CHECKING:
     from pyro_dynogp.fitting import Fit
@@ -77,7 +78,10 @@ class SearchState:
         self.number += 1
         looked = self.look()
         if self.number == 1:
-            self.notes += [*_spikes(looked.residuals, self.rounds.data.known), *looked.notes]
+            self.notes += [
+                *_spikes(looked.residuals, self.rounds.data.known, self.rounds.settings),
+                *looked.notes,
+            ]
         rounds, known = self.rounds, self.rounds.data.known
         chosen: list[Candidate] = []
         if self.left:
@@ -199,7 +203,8 @@ class SearchState:
         self.current, self.model = fit, replace(fit.model, scaling=None)
 
 
-def _spikes(residuals: Sequence[Residuals], record: Record) -> list[str]:
+def _spikes(residuals: Sequence[Residuals], record: Record, settings: LoopSettings) -> list[str]:
     """Spikes of the outputs, in words, also in samples that tests leave out."""
     whole = [replace(one, output=record.outputs[:, a]) for a, one in enumerate(residuals)]
-    return [fault.sentence for one in whole if (fault := data_spikes(one)) is not None]
+    faults = [data_spikes(one, settings) for one in whole]
+    return [fault.sentence for fault in faults if fault is not None]

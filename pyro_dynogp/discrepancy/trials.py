@@ -12,13 +12,13 @@ from scipy.special import logsumexp
 from pyro_dynogp.criticism.densities import pointwise_log_density
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.refits import energy, poles_of, quick_fit, race
-from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
 from pyro_dynogp.effects.base import Compared, Score
 from pyro_dynogp.fitting import Fit
 from pyro_dynogp.models.delays import comparable
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.variants import Model
 from pyro_dynogp.prediction.first_state import beginning
+from pyro_dynogp.statistics.settings import LoopSettings
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,10 @@ class Trial:
         refine: makes finer variants of the best one, given the training data and how many times it
             did so; none for none.
         base: fit of the model that is extended, to start from.
-        seed: of fresh starts.
+        seed: of fresh starts. settings: thresholds.
         score: what densities are of, see `held_out_density`.
         compared: on which data variants are, see `Effect`.
         fit: of a single model to the first fold's training data, where there is one already.
-        settings: thresholds.
     """
 
     models: tuple[Model, ...]
@@ -44,11 +43,11 @@ class Trial:
     folds: tuple[np.ndarray, ...]
     base: Fit
     seed: int
+    settings: LoopSettings
     score: Score = "one step"
     refine: Callable[[Model, Record, int], Sequence[Model]] | None = None
     compared: Compared = "training"
     fit: Fit | None = None
-    settings: LoopSettings = DEFAULTS
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,9 +196,9 @@ def forecast_errors(fit: Fit, record: Record, fold: np.ndarray) -> tuple[np.ndar
 
 def one_step_density(fit: Fit, record: Record) -> np.ndarray:
     """Log-density (n, n_y) of each output given the outputs before it, NaN where missing."""
-    prepared = fit.model.check(record)[0]
-    outputs = output_process(beginning(fit, prepared, predicting=True), fit.scaling, prepared)
-    each = pointwise_log_density(outputs, prepared.tensors().observations, "forecast")
+    (along,) = fit.model.prepare(record)
+    outputs = output_process(beginning(fit, along, predicting=True), along)
+    each = pointwise_log_density(outputs, along.observations, "forecast")
     return logsumexp(each, axis=0) - np.log(len(each))
 
 
@@ -209,7 +208,7 @@ def stretches(mask: np.ndarray) -> list[slice]:
     return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def interleaved(count: int, blocks: int = DEFAULTS.folds) -> tuple[np.ndarray, ...]:
+def interleaved(count: int, blocks: int) -> tuple[np.ndarray, ...]:
     """Two folds (n,): every other block of a record, and those between but for the first.
 
     What happens at one instant has data on either side of it in both.

@@ -53,6 +53,16 @@ def one_step(observed: ObservedLTIProcess, y: Tensor) -> Moments:
     return _moments(observed, y, apply(K.innovations, K, residual), K.innovation_variance, missing)
 
 
+def innovations(observed: ObservedLTIProcess, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Errors (*b, *event) of the predictions of `one_step` and their variances.
+
+    Of a missing sample the error is zero and the variance infinite.
+    """
+    residual, _, K = _factored(observed, y)
+    error = apply(K.innovations, K, residual)
+    return observed.from_rows(error), observed.from_rows(K.innovation_variance)
+
+
 def ahead(observed: ObservedLTIProcess, y: Tensor, horizon: int) -> Moments:
     """Of each noise-free sample given those at least `horizon` samples before it."""
     residual, missing, K = _factored(observed, y)
@@ -86,9 +96,7 @@ def _factored(
 ) -> tuple[Tensor, Tensor | None, SemiseparableCovariance]:
     """Departures (*b, N), zero where missing; where that is; covariance of the samples."""
     residual, missing = split_missing(observed.rows(y - observed.mean))
-    v = observed.noise_rows
-    v = v if missing is None else v.masked_fill(missing, torch.inf)
-    return residual, missing, observed.covariance(v)
+    return residual, missing, observed.covariance(observed.noise, missing)
 
 
 def _moments(

@@ -25,10 +25,11 @@ from pyro_dynogp.distributions.trajectory import (
     real_or_missing,
     split_missing,
 )
+from pyro_dynogp.lti.covariance import jitter_variance
 from pyro_dynogp.lti.grid import TimeGrid, time_grid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import Response, as_inputs, mean_response
-from pyro_dynogp.lti.semiseparable import SemiseparableCovariance, jitter_variance
+from pyro_dynogp.lti.semiseparable import SemiseparableCovariance
 from pyro_dynogp.lti.state import ModalState
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.tensors import Numbers, as_tensor, broadcast
@@ -124,17 +125,18 @@ class LTIProcess(Trajectory):
         p = self.covariance(unseen.to(self.modes.poles.device)).signal_variance_given_past
         return self.from_rows(p).expand(self.batch_shape + self.event_shape)
 
-    def covariance(self, noise_variance: Tensor) -> SemiseparableCovariance:
-        """Covariance of the trajectory plus independent noise of the given variance (*b, N)."""
-        return SemiseparableCovariance(
-            self.modes, self.grid, noise_variance, self.initial_covariance
-        )
+    def covariance(
+        self, noise_variance: Tensor, missing: Tensor | None = None
+    ) -> SemiseparableCovariance:
+        """Covariance of the trajectory plus independent noise; see `Trajectory`."""
+        P0 = self.initial_covariance
+        return SemiseparableCovariance(self.modes, self.grid, noise_variance, P0, missing)
 
     @property
-    def noise_rows(self) -> Tensor:
-        """The jitter, as a variance (*b, N) [output^2]."""
+    def noise(self) -> Tensor:  # type: ignore[override]
+        """The jitter, as a variance (*b, n_y) [output^2]."""
         v = jitter_variance(self.modes, self.initial_covariance, self.jitter)
-        return v.expand((*v.shape[:-1], self._size))
+        return v.expand((*v.shape[:-1], self.modes.outputs))
 
     def observed(self, noise_sd: Numbers, *, varying: bool = False) -> ObservedLTIProcess:
         """Trajectory plus white measurement noise, the trajectory integrated out.
@@ -187,7 +189,7 @@ class ObservedLTIProcess(Trajectory):
                 advice="Without measurement noise two samples of one time cannot differ: "
                 "give noise_sd > 0 or drop the repeated time.",
             )  # fmt: skip
-        self.noise_variance, batch = noise_of_samples(sd, process.event_shape, varying)
+        self.noise, batch = noise_of_samples(sd, process.event_shape, varying)
         self._shape(broadcast(process.batch_shape, batch), len(process.grid), validate_args)
 
     @property
@@ -206,14 +208,16 @@ class ObservedLTIProcess(Trajectory):
         signal = self.process.variance.expand(self.batch_shape + self.event_shape)
         return signal + self.noise_variance
 
-    def covariance(self, noise_variance: Tensor) -> SemiseparableCovariance:
-        """Covariance of the trajectory plus independent noise of the given variance (*b, N)."""
-        return self.process.covariance(noise_variance)
+    def covariance(
+        self, noise_variance: Tensor, missing: Tensor | None = None
+    ) -> SemiseparableCovariance:
+        """Covariance of the trajectory plus independent noise; see `Trajectory`."""
+        return self.process.covariance(noise_variance, missing)
 
     @property
-    def noise_rows(self) -> Tensor:
-        """Measurement-noise variance (*b, N) [output^2]."""
-        return self.rows(self.noise_variance)
+    def noise_variance(self) -> Tensor:
+        """Measurement-noise variance of each sample (*b, *event) [output^2]."""
+        return self.from_rows(self.noise_rows)
 
 
 class ConditionedLTIProcess(Trajectory):
@@ -253,26 +257,22 @@ class ConditionedLTIProcess(Trajectory):
         residual, missing = split_missing(self.observed.rows(value - observed.mean))
         self.residual = residual
         v = observed.noise_rows
-        self.noise_with_missing = v if missing is None else v.masked_fill(missing, torch.inf)
-        self.K = self.prior.covariance(self.noise_with_missing)
+        self.noise = v if missing is None else v.masked_fill(missing, torch.inf)
+        self.K = self.prior.covariance(observed.noise, missing)
         self._with_jitter: SemiseparableCovariance | None = None
         self._shape(residual.shape[:-1], len(self.prior.grid), validate_args)
 
-    def covariance(self, noise_variance: Tensor) -> SemiseparableCovariance:
+    def covariance(
+        self, noise_variance: Tensor, missing: Tensor | None = None
+    ) -> SemiseparableCovariance:
         """Prior covariance plus independent noise."""
-        return self.prior.covariance(noise_variance)
-
-    @property
-    def noise_rows(self) -> Tensor:
-        """Noise of the samples, infinite where missing (*b, N)."""
-        return self.noise_with_missing
+        return self.prior.covariance(noise_variance, missing)
 
     @property
     def _jittered(self) -> SemiseparableCovariance:
         """Covariance of the samples under the prior with jitter, which can be drawn from."""
         if self._with_jitter is None:
-            v = self.noise_with_missing + self.prior.noise_rows
-            self._with_jitter = self.prior.covariance(v)
+            self._with_jitter = self.prior.covariance(self.noise_rows + self.prior.noise_rows)
         return self._with_jitter
 
     @property

@@ -58,13 +58,24 @@ class Trajectory(TorchDistribution):
         """(*batch, *event)."""
         raise NotImplementedError
 
+    # White-noise variance (*b, n_y) where it is the same at all times, else of each row (*b, N);
+    # infinite where a sample is missing.
+    noise: Tensor
+
     @property
     def noise_rows(self) -> Tensor:
         """White-noise variance of each row (*b, N)."""
-        raise NotImplementedError
+        v = self.noise
+        repeats = self._size // v.shape[-1]
+        return v.unsqueeze(-2).expand((*v.shape[:-1], repeats, v.shape[-1])).flatten(-2)
 
-    def covariance(self, noise_variance: Tensor) -> SemiseparableCovariance:
-        """Covariance of the noise-free trajectory plus noise of variance (*b, N)."""
+    def covariance(
+        self, noise_variance: Tensor, missing: Tensor | None = None
+    ) -> SemiseparableCovariance:
+        """Covariance of the noise-free trajectory plus noise of variance (*b, n_y) or (*b, N).
+
+        missing (*b, N) is True in rows without a sample.
+        """
         raise NotImplementedError
 
     def expand(self, batch_shape: Any, _instance: Any = None) -> Any:
@@ -88,7 +99,7 @@ class Trajectory(TorchDistribution):
     def root(self) -> SemiseparableCovariance:
         """The covariance S + diag(v), factored once."""
         if self._root is None:
-            self._root = self.covariance(self.noise_rows)
+            self._root = self.covariance(self.noise)
         return self._root
 
     def rsample(self, sample_shape: Sequence[int] = ()) -> Tensor:
@@ -112,10 +123,7 @@ class Trajectory(TorchDistribution):
         if self._validate_args:
             self._validate_sample(value)
         residual, missing = split_missing(self.rows(value - self.mean))
-        if missing is None:
-            K = self.root
-        else:
-            K = self.covariance(self.noise_rows.masked_fill(missing, math.inf))
+        K = self.root if missing is None else self.covariance(self.noise, missing)
         batch = batch_dims(K)
         lead = residual.shape[: residual.dim() - 1 - batch]
         log_prob = K.log_prob(columns(residual, batch))  # *b, R
@@ -132,7 +140,7 @@ class Trajectory(TorchDistribution):
 
 def batch_dims(K: SemiseparableCovariance) -> int:
     """Number of batch dimensions of a factored covariance."""
-    return K.innovation_variance.dim() - 1
+    return len(K.batch_shape)
 
 
 def columns(x: Tensor, batch: int) -> Tensor:
@@ -160,7 +168,7 @@ def split_missing(residual: Tensor) -> tuple[Tensor, Tensor | None]:
 
 
 def noise_of_samples(sd: Tensor, event: torch.Size, varying: bool) -> tuple[Tensor, torch.Size]:
-    """Variance (*b, *event) of the noise of each sample, and its batch shape b.
+    """Variance of the noise, and its batch shape b: (*b, n_y), or (*b, N) where it varies.
 
     Args:
         sd: standard deviation [output] (*b), or (*b, n_y) of several outputs; with `varying`
@@ -179,6 +187,4 @@ def noise_of_samples(sd: Tensor, event: torch.Size, varying: bool) -> tuple[Tens
         raise invalid("noise_sd", expected=f"shape (..., {tail})", got=f"shape {tuple(sd.shape)}")
     batch = sd.shape[: sd.dim() - len(tail)]
     v = sd.square()
-    if not varying:
-        v = v.unsqueeze(-1 - len(tail)).expand((*batch, *event))
-    return v, batch
+    return v.reshape((*batch, -1)), batch

@@ -12,6 +12,7 @@ from pyro_dynogp.data.channels.base import Channel, signal_of
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.models.variants import Model
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
+from pyro_dynogp.statistics.settings import LoopSettings
 
 if TYPE_CHECKING:
     from pyro_dynogp.fitting import Fit
@@ -80,13 +81,20 @@ class Effect:
         """Whether inputs that follow the output's disturbances may look like it."""
         return self.acts_on == "inputs"
 
-    def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
+    def detect(
+        self, residuals: Residuals, settings: LoopSettings, seed: int = 0
+    ) -> Sequence[Evidence]:
         """Evidence for the effect, one for each channel it may come from; may be empty.
 
+        Args:
+            residuals: of one output (n,). settings: thresholds, those of the loop.
+            seed: of what is simulated under the null.
+
         Raises:
-            ValueError: where the residuals cannot be tested for it.
+            ValueError: where the residuals cannot be tested for it, as where too few samples are
+                measured (those held out, for effects that are looked for there).
         """
-        return listed(self.test(residuals, seed=seed))
+        return listed(self.test(residuals, settings, seed=seed))
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
         """Variants of the model with the effect as a block; empty where it is only reported."""

@@ -14,18 +14,16 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.effects.base import Effect
 from pyro_dynogp.effects.clocks import ZONES, all_zones, in_zone, stamps_of
 from pyro_dynogp.models.variants import Model, with_channel, without_channel
-from pyro_dynogp.statistics.bootstrap import columns_score, replicates, sieve, spanning
 from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
-from pyro_dynogp.statistics.shares_of_inputs import own
+from pyro_dynogp.statistics.pictures import about, averages, evidence, residual_axis
+from pyro_dynogp.statistics.prewhitening import free_columns, prewhitened, spanning
+from pyro_dynogp.statistics.settings import LoopSettings
+from pyro_dynogp.statistics.shares_of_inputs import input_columns
 from pyro_dynogp.support.errors import invalid
 
-# Days that must be looked at before a contrast is tried: fewer do not repeat it.
-DAYS_FOR_HOURS, DAYS_FOR_WEEK, DAYS_FOR_YEAR = 3, 14, 548
 WEEKDAYS = ("Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun")
 TURN = ("20 Dec", "24 Dec", "28 Dec", "1 Jan", "5 Jan", "9 Jan", "13 Jan")
 SEASONS = ("Dec-Feb", "Mar-May", "Jun-Aug", "Sep-Nov")
-# Nats by which another clock than that of the stamps must be better to be named.
-OWN = 3.0
 # Contrasts of the year; the others are of the day and the week.
 YEARLY = ("season", "time of year", "turn of the year")
 # Parts of the calendar under the names of the channel that stands for them.
@@ -53,7 +51,9 @@ class Contrast:
     labels: tuple[str, ...]
 
 
-def calendar(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 0) -> list[Evidence]:
+def calendar(
+    residuals: Residuals, settings: LoopSettings, *, zones: Sequence[str] = (), seed: int = 0
+) -> list[Evidence]:
     """A level that depends on the calendar, beside what the inputs explain; all samples.
 
     Weeks and years are long: what was fitted to is looked at, too. A fit can take part of a
@@ -65,7 +65,7 @@ def calendar(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 0) 
     zones, and one for all of the year: what repeats every day must not hide what does once a year.
 
     Args:
-        residuals: of one output (n,), with stamps.
+        residuals: of one output (n,), with stamps. settings: thresholds.
         zones: IANA names of time zones whose clocks are tried beside that of the stamps.
         seed: of the replicates.
 
@@ -76,21 +76,30 @@ def calendar(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 0) 
         where clocks cannot be told apart).
 
     Raises:
-        ValueError: where there are no stamps, a zone is unknown, the record is shorter than three
-            days, or fewer than 30 held-out samples are measured.
+        ValueError: where there are no stamps, a zone is unknown, the record is shorter than
+            `days_for_hours`, or too few samples are measured.
 
-    Source: F test of group contrasts in the whitened residual; its null by `sieve`.
+    Source: F test of group contrasts in the whitened residual; its null by `prewhitened`.
     """
-    contrasts, columns = _contrasts(residuals, zones, np.isfinite(residuals.residual))
+    contrasts, columns = _contrasts(residuals, zones, settings)
     of_year = [c for c in contrasts if c.what in YEARLY]
     others = [c for c in contrasts if c.what not in YEARLY]
     # One clock is enough to take the calendar's lines out of the noise's filter.
     lines = sorted({k for c in contrasts if c.zone == contrasts[0].zone for k in c.columns})
-    return [_best_of(residuals, some, columns, lines, seed) for some in (others, of_year) if some]
+    return [
+        _best_of(residuals, tried, columns, lines, settings, seed)
+        for tried in (others, of_year)
+        if tried
+    ]
 
 
 def _best_of(
-    r: Residuals, contrasts: Sequence[Contrast], columns: np.ndarray, lines: list[int], seed: int
+    r: Residuals,
+    contrasts: Sequence[Contrast],
+    columns: np.ndarray,
+    lines: list[int],
+    settings: LoopSettings,
+    seed: int,
 ) -> Evidence:
     """Evidence of the contrast that explains most.
 
@@ -99,68 +108,66 @@ def _best_of(
         lines: those that are taken out of the noise's filter.
     """
     x = r.residual
-    variants = [np.array(c.columns) for c in contrasts]
-    few = len(lines) < np.isfinite(x).sum() // 5
-    found = sieve(
+    places = [np.array(c.columns) for c in contrasts]
+    scan = prewhitened(
         x,
-        columns_score(columns, variants, spanning(own(r)), ~np.isfinite(x)),
-        np.array([c.degrees for c in contrasts]),
-        deviations=r.deviations,
-        first=columns[:, lines] if few else None,
-        replicates=replicates(len(r), columns.shape[1]),
+        free_columns(columns, places, [c.degrees for c in contrasts]),
+        spanning(input_columns(r)),
+        r.deviations,
+        settings,
+        first=columns[:, lines] if len(lines) < np.isfinite(x).sum() // 5 else None,
         seed=seed,
     )
     # The record's own clock, where others tell no better.
-    own_zone = str(stamps_of(r).tz)
+    same = (contrasts[scan.best].what, str(stamps_of(r).tz))
     likely = [
-        k for k, one in enumerate(contrasts)
-        if (one.what, one.zone) == (contrasts[found.best].what, own_zone)
-        and found.gain - found.gains[k] < OWN
+        k for k, contrast in enumerate(contrasts)
+        if (contrast.what, contrast.zone) == same
+        and scan.gain - scan.gains[k] < settings.preference
     ]  # fmt: skip
-    best = contrasts[likely[0] if likely else found.best]
-    curve = _averages(r, best, x, found.fitted)
+    best = contrasts[likely[0] if likely else scan.best]
+    curve = _averages(r, best, x, scan.fitted)
     high, low = int(np.argmax(curve.fitted)), int(np.argmin(curve.fitted))
     labels = [best.labels[int(i)] for i in curve.x]
-    return Evidence(
-        effect="calendar",
-        statistic=found.statistic,
-        p_value=found.p_value,
-        gain=found.gain,
-        size=found.size,
-        where={"what": best.what, "zone": best.zone},
-        sentence=f"{r.output_name!r} depends on the {best.what} ({best.zone}) beyond what the "
-        f"model knows: about {found.size:.2g} {r.output_unit} (rms), most at {labels[high]}, "
-        f"least at {labels[low]}.",
-        curve=curve,
+    return evidence(
+        "calendar",
+        scan,
+        {"what": best.what, "zone": best.zone},
+        f"{r.output_name!r} depends on the {best.what} ({best.zone}) beyond what the "
+        f"model knows: {about(r, scan.size)}, most at {labels[high]}, least at {labels[low]}.",
+        curve,
     )
 
 
 def _contrasts(
-    r: Residuals, zones: Sequence[str], looked: np.ndarray
+    r: Residuals, zones: Sequence[str], settings: LoopSettings
 ) -> tuple[list[Contrast], np.ndarray]:
-    """All contrasts that what is looked at repeats, each once; and the columns of all (n, M)."""
-    stamps = stamps_of(r)
-    found, blocks, seen = list[Contrast](), list[np.ndarray](), set[tuple[str, bytes]]()
+    """All contrasts that what is measured repeats, each once; and the columns of all (n, M)."""
+    stamps, measured = stamps_of(r), np.isfinite(r.residual)
+    every, blocks, seen = list[Contrast](), list[np.ndarray](), set[tuple[str, bytes]]()
     for zone in all_zones(stamps, zones):
         local = in_zone(stamps, zone)
-        days = len(np.unique(local[looked].date)) if looked.any() else 0
-        contrasts, columns = _in_zone(local, zone, days)
+        days = len(np.unique(local[measured].date)) if measured.any() else 0
+        contrasts, columns = _in_zone(local, zone, days, settings)
         first, kept = sum(b.shape[1] for b in blocks), list[Contrast]()
         for c in contrasts:
             # Clocks a constant number of hours apart make the same groups: the first is kept.
             key = (c.what, pd.factorize(c.groups)[0].tobytes())
-            if len(np.unique(c.groups[looked])) > 1 and key not in seen:
+            if len(np.unique(c.groups[measured])) > 1 and key not in seen:
                 seen.add(key)
                 kept.append(replace(c, columns=tuple(first + k for k in c.columns)))
         if kept:
-            found += kept
+            every += kept
             blocks.append(columns)
-    if not found:
-        raise invalid("residuals", expected="at least three days held out", got="fewer")
-    return found, np.concatenate(blocks, axis=1)
+    if not every:
+        least = f"at least {settings.days_for_hours} days"
+        raise invalid("residuals", expected=least, got="fewer, or none that repeats")
+    return every, np.concatenate(blocks, axis=1)
 
 
-def _in_zone(local: pd.DatetimeIndex, zone: str, days: int) -> tuple[list[Contrast], np.ndarray]:
+def _in_zone(
+    local: pd.DatetimeIndex, zone: str, days: int, settings: LoopSettings
+) -> tuple[list[Contrast], np.ndarray]:
     """Contrasts of one clock, and their columns (n, M): hours, hours at weekends, weekdays, ..."""
     hour, weekday = np.asarray(local.hour), np.asarray(local.day_of_week)
     weekend = (weekday >= 5).astype(int)
@@ -181,16 +188,16 @@ def _in_zone(local: pd.DatetimeIndex, zone: str, days: int) -> tuple[list[Contra
         columns = (*also, *range(first, first + new.shape[1]))
         contrasts.append(Contrast(what, zone, columns, degrees, groups, tuple(labels)))
 
-    if days >= DAYS_FOR_HOURS:
+    if days >= settings.days_for_hours:
         add("hour of day", K, hours, hour, hours_named)
-    if days >= DAYS_FOR_WEEK:
+    if days >= settings.days_for_week:
         named = hours_named + tuple(f"{h} at weekends" for h in hours_named)
         cells, at_weekends = hour + 24 * weekend, hours * weekend[:, None]
         what = "hour of day by weekday/weekend"
         add(what, 2 * K + 1, at_weekends, cells, named, also=range(24))
         add("weekend", 1, weekend[:, None].astype(float), weekend, ("working days", "weekends"))
         add("weekday", 6, np.eye(7)[weekday], weekday, WEEKDAYS)
-    if days >= DAYS_FOR_YEAR:
+    if days >= settings.days_for_year:
         season, month = np.asarray(local.month % 12) // 3, np.asarray(local.month) - 1
         add("season", 3, np.eye(4)[season], season, SEASONS)
         angle = 2.0 * np.pi * np.asarray(local.day_of_year + local.hour / 24.0) / 365.2425
@@ -206,17 +213,11 @@ def _in_zone(local: pd.DatetimeIndex, zone: str, days: int) -> tuple[list[Contra
 
 def _averages(r: Residuals, best: Contrast, x: np.ndarray, fitted: np.ndarray) -> Curve:
     """Averages of residual and effect in each group, the residual's own average removed."""
-    known = np.isfinite(x)
-    groups, at = np.unique(best.groups[known], return_inverse=True)
-    count = np.bincount(at)
-    y = x[known] - x[known].mean()
-    return Curve(
-        x=groups.astype(float),
-        y=np.bincount(at, y) / count,
-        fitted=np.bincount(at, fitted[known]) / count,
-        x_label=f"{best.what}, {best.zone}",
-        y_label=f"residual of {r.output_name} [{r.output_unit}]",
-    )
+    rows = np.isfinite(x)
+    groups, at = np.unique(best.groups[rows], return_inverse=True)
+    y, effect = averages(at, len(groups), x[rows] - x[rows].mean(), fitted[rows])
+    label = f"{best.what}, {best.zone}"
+    return Curve(groups.astype(float), y, effect, label, residual_axis(r))
 
 
 class CalendarEffect(Effect):
@@ -233,11 +234,13 @@ class CalendarEffect(Effect):
     def __init__(self, zones: Sequence[str] = ZONES) -> None:
         self.zones = tuple(zones)
 
-    def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
+    def detect(
+        self, residuals: Residuals, settings: LoopSettings, seed: int = 0
+    ) -> Sequence[Evidence]:
         """One of the day and the week, and one of the year where the record is long enough."""
         if residuals.stamps is None:
             return []
-        return calendar(residuals, zones=self.zones, seed=seed)
+        return calendar(residuals, settings, zones=self.zones, seed=seed)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
         """The part of the calendar as direct inputs; or all that the model has, on that clock.
@@ -247,16 +250,16 @@ class CalendarEffect(Effect):
         """
         what, zone = str(evidence.where["what"]), str(evidence.where["zone"])
         part = CALENDAR_PARTS.get(what, what)
-        there = [one for one in model.channels if isinstance(one, Calendar)]
+        calendars = [c for c in model.channels if isinstance(c, Calendar)]
         harmonics, plain = 3 if part == "time of year" else 6, model
-        for one in there:
-            if one.what == part:
-                plain = without_channel(plain, one)
-                harmonics = max(harmonics, one.harmonics * (2 if one.zone == zone else 1))
+        for channel in calendars:
+            if channel.what == part:
+                plain = without_channel(plain, channel)
+                harmonics = max(harmonics, channel.harmonics * (2 if channel.zone == zone else 1))
         if part != "time of year":
             harmonics = max(1, min(harmonics, int(0.5 * DAY / record.sampling_time)))
         variants = [with_channel(plain, Calendar(part, zone, harmonics))]
-        if any(one.zone != zone for one in there):
+        if any(channel.zone != zone for channel in calendars):
             channels = tuple(
                 replace(c, zone=zone) if isinstance(c, Calendar) else c for c in model.channels
             )

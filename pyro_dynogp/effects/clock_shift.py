@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -15,24 +16,24 @@ from pyro_dynogp.effects.base import Effect, changed, listed, number_of, set_las
 from pyro_dynogp.effects.clock_shift_score import refined_shift, score_of_shifts, shifts_of
 from pyro_dynogp.effects.clocks import ZONES, all_zones, clock_shares, in_zone
 from pyro_dynogp.models.variants import Model, with_channel
-from pyro_dynogp.statistics.bootstrap import replicates, sieve, spanning
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
+from pyro_dynogp.statistics.pictures import about, evidence, in_words, instant, over_time
+from pyro_dynogp.statistics.prewhitening import prewhitened, spanning
+from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.statistics.shares_of_inputs import check_inputs
-from pyro_dynogp.statistics.time_pictures import in_words, instant, over_time
 from pyro_dynogp.support.errors import invalid
 
 # Shifts of the whole record, which are none of the clock's, together with their sums [steps].
 WHOLE = (-4, -2, -1, 0, 1, 2, 4)
 # Channels of the largest share that are tried.
 CHANNELS = 6
-# A rule has no instant to choose: it wins unless another instant is this much better [nats]; so
-# do summers beside winters.
-PREFERENCE = 3.0
 # Samples by which the instant of a shifted clock is moved to refine it, first and then.
 FARTHEST = ((7, 14, 21, 28, 35), (1, 2, 3))
 
 
-def clock_shift(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 0) -> Evidence:
+def clock_shift(
+    residuals: Residuals, settings: LoopSettings, *, zones: Sequence[str] = (), seed: int = 0
+) -> Evidence:
     """An input's time stamps that are off by a constant in part of the record.
 
     Where they are, the output has the input's share of the mean at another time: s(t + shift) in
@@ -43,7 +44,7 @@ def clock_shift(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 
     are one clock, whose share is what the mean repeats.
 
     Args:
-        residuals: of one output (n,).
+        residuals: of one output (n,). settings: thresholds.
         zones: IANA names of time zones whose daylight saving is tried.
         seed: of the replicates.
 
@@ -54,11 +55,11 @@ def clock_shift(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 
         "winters": when the channel is off) where one fits as well as any instant.
 
     Raises:
-        ValueError: where fewer than 30 samples are measured, there is no input that acts on the
+        ValueError: where too few samples are measured, there is no input that acts on the
             mean, or a zone is unknown.
 
     Source: likelihood ratio with an unknown instant of change, as Andrews, Econometrica 61(4):821
-    (1993), in the whitened residual; the null by `sieve`.
+    (1993), in the whitened residual; the null by `prewhitened`.
     """
     r = residuals
     check_inputs(r)
@@ -66,22 +67,14 @@ def clock_shift(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 
     if not names:
         raise invalid("residuals", expected="an input that acts on the mean", got="none")
     rules, parts = _rules(r, zones)
-    tried = shifts_of(r, shares, parts)
+    tried = shifts_of(r, shares, parts, settings)
     # A shift of the whole record is a dead time, and a wrong gain is not a matter of clocks.
     everywhere = [shifted(s, r.time, k * r.step) for s in shares.T for k in WHOLE]
     nuisance = spanning(np.column_stack([r.mean, *everywhere]))
-    missing = ~np.isfinite(r.residual)
-    count = tried.changes.shape[1] * (len(parts) + len(tried.edges))
-    found = sieve(
-        r.residual,
-        score_of_shifts(tried, nuisance, missing),
-        np.ones(count),
-        deviations=r.deviations,
-        replicates=replicates(len(r), 2 * nuisance.shape[1] + tried.changes.shape[1]),
-        seed=seed,
-    )
+    variants = score_of_shifts(tried)
+    scan = prewhitened(r.residual, variants, nuisance, r.deviations, settings, seed=seed)
     J = tried.changes.shape[1]
-    best = _preferred(found.gains, found.best, rules, J)
+    best = _preferred(scan.gains, scan.best, rules, J, settings.preference)
     place, j = divmod(best, J)
     name, shift = names[tried.channels[j]], float(tried.shifts[j])
     share = shares[:, tried.channels[j]]
@@ -95,38 +88,45 @@ def clock_shift(residuals: Residuals, *, zones: Sequence[str] = (), seed: int = 
     else:
         first = int(tried.edges[place - len(parts)])
         at, shift, effect = refined_shift(
-            r, found.whitener, nuisance, share, first, shift, tried.edges
+            r, scan.whitener, nuisance, share, first, shift, tried.edges, settings
         )
         when = f"from {instant(r, at)}"
     where |= {"shift": shift, "time": float(r.time[at]), "time_unit": r.time_unit}
     if r.stamps is not None:
         where |= {"stamp": r.stamps[at].isoformat(), "zone": str(r.stamps.tz)}
     size = float(np.std(effect))
-    return Evidence(
-        effect="clock shift",
-        statistic=found.statistic,
-        p_value=found.p_value,
-        gain=float(found.gains[best]),
-        size=size,
-        where=where,
-        sentence=f"{off(' and '.join(map(repr, name)), shift, f' {r.time_unit}')} {when}: "
-        f"about {size:.2g} {r.output_unit} (rms) of {r.output_name!r}.",
-        curve=over_time(r, effect - effect.mean()),
+    return evidence(
+        "clock shift",
+        replace(scan, best=best),
+        where,
+        f"{off(' and '.join(map(repr, name)), shift, f' {r.time_unit}')} {when}: "
+        f"{about(r, size)} of {r.output_name!r}.",
+        over_time(r, effect - effect.mean()),
+        size,
     )
 
 
-def _preferred(gains: np.ndarray, best: int, rules: Sequence[tuple[str, str]], count: int) -> int:
+def _preferred(
+    gains: np.ndarray,
+    best: int,
+    rules: Sequence[tuple[str, str]],
+    count: int,
+    preference: float,
+) -> int:
     """The best variant, or that of a rule where it is about as good.
+
+    A rule has no instant to choose: it wins unless another instant is better by more than a
+    parameter must gain; so do summers beside winters.
 
     Args:
         gains: of all variants, those of rules first [nats]. best: place of the largest.
-        rules: season and zone of each. count: variants of each.
+        rules: season and zone of each. count: variants of each. preference: that gain [nats].
     """
     ruled = len(rules) * count
-    if not ruled or gains[:ruled].max() <= gains[best] - PREFERENCE:
+    if not ruled or gains[:ruled].max() <= gains[best] - preference:
         return best
     # Daylight saving is an hour of summers, unless winters are that much better.
-    worse = PREFERENCE * np.array([season == "winters" for season, _ in rules])
+    worse = preference * np.array([season == "winters" for season, _ in rules])
     return int(np.argmax(gains[:ruled] - np.repeat(worse, count)))
 
 
@@ -172,10 +172,12 @@ class ClockShift(Effect):
     def __init__(self, zones: Sequence[str] = ZONES) -> None:
         self.zones = tuple(zones)
 
-    def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
+    def detect(
+        self, residuals: Residuals, settings: LoopSettings, seed: int = 0
+    ) -> Sequence[Evidence]:
         """One for each input."""
         zones = () if residuals.stamps is None else self.zones
-        return listed(clock_shift(residuals, zones=zones, seed=seed))
+        return listed(clock_shift(residuals, settings, zones=zones, seed=seed))
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
         """The input, and all inputs, read at other times from the instant on."""
@@ -192,12 +194,12 @@ class ClockShift(Effect):
 
     def sentence(self, evidence: Evidence, model: Model) -> str:
         """The shift and its instant as refits have them."""
-        found = set_last(model, ShiftedClock, "times")
-        last = found[-1]
+        shifted_clocks = set_last(model, ShiftedClock, "times")
+        last = shifted_clocks[-1]
         if len(last.times) > 1:
             return evidence.sentence
         (at,), where = last.times, evidence.where
-        names = " and ".join(repr(c.channel) for c in found)
+        names = " and ".join(repr(c.channel) for c in shifted_clocks)
         if "stamp" in where:
             stamp = pd.Timestamp(str(where["stamp"])).tz_convert(str(where["zone"]))
             stamp += pd.Timedelta(at - number_of(evidence, "time"), "s")
@@ -208,8 +210,8 @@ class ClockShift(Effect):
 
     def refine(self, model: Model, record: Record, times: int) -> Sequence[Model]:
         """Other instants and shifts nearby, some samples away; what a rule says stays."""
-        found = set_last(model, ShiftedClock, "times")
-        last = found[-1]
+        shifted_clocks = set_last(model, ShiftedClock, "times")
+        last = shifted_clocks[-1]
         if len(last.times) > 1:
             return []
         step, coarse = record.sampling_time, FARTHEST[times]
@@ -223,7 +225,9 @@ class ClockShift(Effect):
             if record.time[0] < time < record.time[-1] and shift
             if (time, shift) != (last.times[0], last.shift)
         ]
-        return [changed(model, found, shift=shift, times=(time,)) for time, shift in inside]
+        return [
+            changed(model, shifted_clocks, shift=shift, times=(time,)) for time, shift in inside
+        ]
 
 
 def seasons(record: Record, zone: str, season: str) -> tuple[float, ...]:
@@ -238,9 +242,9 @@ def seasons(record: Record, zone: str, season: str) -> tuple[float, ...]:
         first.floor("30min"), periods=48 * int(record.duration / DAY + 2 * 366), freq="30min"
     )
     saving = np.array([bool(stamp.dst()) for stamp in halves.tz_convert(zone).to_pydatetime()])
-    there = saving if season == "summers" else ~saving
-    changes = np.flatnonzero(np.diff(there.astype(int))) + 1
-    if len(changes) and not there[changes[0]]:
+    inside = saving if season == "summers" else ~saving
+    changes = np.flatnonzero(np.diff(inside.astype(int))) + 1
+    if len(changes) and not inside[changes[0]]:
         changes = changes[1:]
     seconds = np.asarray((halves - record.start).total_seconds())
     return tuple(float(seconds[k]) for k in changes)

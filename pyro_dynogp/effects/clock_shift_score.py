@@ -7,14 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from pyro_dynogp.data.signals import shifted
-from pyro_dynogp.statistics.bootstrap import Prepare, Score, Scored, log_ratio, projector, solved
+from pyro_dynogp.statistics.autoregression import Whitener
 from pyro_dynogp.statistics.evidence import Residuals
-from pyro_dynogp.statistics.whitening import Whitener
+from pyro_dynogp.statistics.prewhitening import Projection, Score, Scored, Variants, log_ratio
+from pyro_dynogp.statistics.settings import LoopSettings
 
 # Shifts that are tried [steps], both ways; and one hour where there are stamps.
 SHIFTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
-# Instants of change on the first pass, and the share of the record kept on either side.
-INSTANTS, END = 60, 0.05
+# Instants of change on the first pass.
+INSTANTS = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +44,9 @@ class Shifts:
         return np.where(np.arange(len(self.changes)) >= at, self.changes[:, j], 0.0)
 
 
-def shifts_of(r: Residuals, shares: np.ndarray, parts: np.ndarray) -> Shifts:
+def shifts_of(
+    r: Residuals, shares: np.ndarray, parts: np.ndarray, settings: LoopSettings
+) -> Shifts:
     """All shifts that are tried.
 
     Args:
@@ -61,7 +64,7 @@ def shifts_of(r: Residuals, shares: np.ndarray, parts: np.ndarray) -> Shifts:
             lengths.add(steps * r.step)
     shifts = np.array([sign * d for d in sorted(lengths) for sign in (1.0, -1.0)])
     changes = [shifted(s, r.time, -d) - s for s in shares.T for d in shifts]
-    low, high = max(int(END * n), 5), n - max(int(END * n), 5)
+    low, high = max(int(settings.clock_margin * n), 5), n - max(int(settings.clock_margin * n), 5)
     edges = np.unique(np.linspace(low, high, min(INSTANTS, high - low)).astype(int))
     return Shifts(
         changes=np.column_stack(changes),
@@ -72,17 +75,16 @@ def shifts_of(r: Residuals, shares: np.ndarray, parts: np.ndarray) -> Shifts:
     )
 
 
-def score_of_shifts(tried: Shifts, nuisance: np.ndarray, missing: np.ndarray) -> Prepare:
-    """Score of all shifts from all edges, by sums over what lies between two edges.
+def score_of_shifts(tried: Shifts) -> Variants:
+    """All shifts from all edges, by sums over what lies between two edges.
 
     At an edge the whitened effect differs from the part of the whitened change for as many samples
     as the filter has coefficients; that is left out.
     """
 
-    def prepare(whiten: Whitener) -> Score:
-        there, Q, R = projector(whiten, nuisance, missing)
-        rows = np.flatnonzero(there) + whiten.order
-        w = whiten(tried.changes)[there]
+    def prepare(under: Projection) -> Score:
+        rows = np.flatnonzero(under.rows) + under.whiten.order
+        w = under.filtered(tried.changes)
         starts = np.searchsorted(rows, tried.edges)
         masks = tried.parts[:, rows]
         ends = [*starts[1:], len(rows)]
@@ -96,26 +98,23 @@ def score_of_shifts(tried: Shifts, nuisance: np.ndarray, missing: np.ndarray) ->
 
         squares = np.square(w)
         later = np.concatenate([np.cumsum(squares[::-1], axis=0)[::-1], 0.0 * squares[:1]])[starts]
-        beside = against(Q)
-        norm = np.concatenate([masks @ squares, later]) - np.square(beside).sum(2)
+        norm = np.concatenate([masks @ squares, later]) - np.square(against(under.Q)).sum(2)
 
         def score(x: np.ndarray) -> Scored:
-            e0 = whiten(x)[there]
-            q = Q.T @ e0
-            e = e0 - Q @ q
+            e = under(x)
             explained = np.maximum(2.0 * against(e) - norm, 0.0).ravel()
             gains = len(e) * log_ratio(explained, float(e @ e))
 
             def fit(variant: int) -> tuple[np.ndarray, np.ndarray]:
-                effect = tried.effect(variant)
-                also = beside.reshape(-1, Q.shape[1])[variant]
-                return effect - effect.mean(), effect + nuisance @ solved(R, q - also)
+                return under.with_nuisance(tried.effect(variant), x)
 
             return gains, fit
 
         return score
 
-    return prepare
+    J = tried.changes.shape[1]
+    count = J * (len(tried.parts) + len(tried.edges))
+    return Variants(prepare, np.ones(count), J)
 
 
 def refined_shift(
@@ -126,21 +125,19 @@ def refined_shift(
     at: int,
     shift: float,
     edges: np.ndarray,
+    settings: LoopSettings,
 ) -> tuple[int, float, np.ndarray]:
     """Instant and shift near those on the grids, alternately, and their effect (n,)."""
     x = r.residual
-    there, Q, _ = projector(whiten, nuisance, ~np.isfinite(x))
-    e = whiten(x)[there]
-    e = e - Q @ (Q.T @ e)
+    under = Projection(whiten, nuisance, ~np.isfinite(x), settings)
+    e = under(x)
 
     def effect(at: int, shift: float) -> np.ndarray:
         change = shifted(share, r.time, -shift) - share
         return np.where(np.arange(len(x)) >= at, change, 0.0)
 
     def left(at: int, shift: float) -> float:
-        w = whiten(effect(at, shift))[there]
-        w = w - Q @ (Q.T @ w)
-        return float(np.square(e - w).sum())
+        return float(np.square(e - under(effect(at, shift))).sum())
 
     stride = int(np.diff(edges).max(initial=1))
     for _ in range(2):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -16,40 +15,30 @@ from pyro_dynogp.effects.base import (
     FINER,
     Effect,
     changed,
-    listed,
     number_of,
     set_last,
     unit_of,
 )
 from pyro_dynogp.effects.delay_regression import likely_delays, resolved
 from pyro_dynogp.models.variants import Model, with_channel, without_channel
-from pyro_dynogp.statistics.detecting import (
-    NOTICED,
-    labelled,
-    lasting,
-    located,
-    profiled,
-    regained,
-    unit,
-)
+from pyro_dynogp.statistics.detecting import Search, lasting, regained
 from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
+from pyro_dynogp.statistics.pictures import about, evidence, labelled, unit
 from pyro_dynogp.statistics.regression import with_past
+from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.statistics.shares_of_inputs import paths
 
 # Delays that are tried whatever the data say.
 COARSE = 5
 
 
-def dead_time(residuals: Residuals, *, seed: int = 0) -> Evidence:
+def dead_time(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> Evidence:
     """Test whether the output follows an input later (or earlier) than the model says.
 
     The column is mean_j(t - d) - mean_j(t), where mean_j is what input j contributes to the mean:
     all of it with one input, the share by `paths` with several. The delay is that at which the
     column fits with a weight of one. `where`: channel, delay (additional, > 0 for later)
     [time unit].
-
-    Raises:
-        ValueError: where fewer than 30 samples are held out and measured.
     """
     r = residuals
     names, shares = r.input_names, paths(r).shares
@@ -63,28 +52,25 @@ def dead_time(residuals: Residuals, *, seed: int = 0) -> Evidence:
     tried = [(j, float(d)) for j in range(len(names)) for d in coarse]
     variants = [with_past(late(j, d)) for j, d in tried]
     mean = r.mean[:, None]
-    found = lasting(regained(r), variants, mean, seed)
-    j, nearest = tried[found.best]
+    scan = lasting(regained(r, settings), variants, mean, settings, seed)
+    j, delay = tried[scan.best]
     # Without a column for no delay, small ones of either sign look the same but for their weight.
     grid = np.unique(np.concatenate([coarse, np.linspace(-1.0, 1.0, 9) * r.step]))
-    delay = nearest
-    if found.p_value < NOTICED:
-        delay = located(r, lambda d: late(j, d), nearest, grid, mean, weight=1.0)
-    profile = profiled(r, [late(j, d) for d in grid], mean, late(j, delay), weight=1.0)
-    column = late(j, delay)
+    search = Search(r, mean, settings, weight=1.0)
+    if scan.p_value < settings.noticed:
+        delay = search.located(lambda d: late(j, d), delay, grid)
+    profile = search.gains([late(j, d) for d in grid], late(j, delay))
+    size = float(late(j, delay).std())
     word = "later" if delay > 0 else "earlier"
     label = labelled("additional delay", r.time_unit)
-    return Evidence(
-        effect="dead time",
-        statistic=found.statistic,
-        p_value=found.p_value,
-        gain=found.gain,
-        size=float(column.std()),
-        where={"channel": names[j], "delay": delay},
-        sentence=f"'{r.output_name}' follows channel '{names[j]}' {abs(delay):.3g}"
-        f"{unit(r.time_unit)} {word} than the model says, "
-        f"about {column.std():.2g}{unit(r.output_unit)} (rms).",
-        curve=Curve(grid, profile, np.full(len(grid), np.nan), label, "gain [nats]"),
+    return evidence(
+        "dead time",
+        scan,
+        {"channel": names[j], "delay": delay, "time_unit": r.time_unit},
+        f"'{r.output_name}' follows channel '{names[j]}' {abs(delay):.3g}"
+        f"{unit(r.time_unit)} {word} than the model says, {about(r, size)}.",
+        Curve(grid, profile, np.full(len(grid), np.nan), label, "gain [nats]"),
+        size,
     )
 
 
@@ -99,10 +85,7 @@ class DeadTime(Effect):
         "time nothing moves at first, more dynamics begin at once",
     }
 
-    def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
-        """One for each input."""
-        found = listed(dead_time(residuals, seed=seed))
-        return [replace(e, where={**e.where, "time_unit": residuals.time_unit}) for e in found]
+    test = staticmethod(dead_time)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
         """Each input, and all of them, delayed: by what regressions and the evidence say, and more.
@@ -122,28 +105,28 @@ class DeadTime(Effect):
         for place in places:
             chosen = tuple(names[k] for k in place)
             u, y = prepared.inputs[:, : len(names)], prepared.outputs[:, 0]
-            found = {step * d for d in likely_delays(y, u, place, longest)}
-            delays = grid | found | (around if channel in chosen else set())
+            likely = {step * d for d in likely_delays(y, u, place, longest)}
+            delays = grid | likely | (around if channel in chosen else set())
             tried = (_later(model, chosen, delay, 0.2 * step) for delay in resolved(delays, record))
-            variants += [one for one in tried if one is not None]
+            variants += [later for later in tried if later is not None]
         return variants
 
     def sentence(self, evidence: Evidence, model: Model) -> str:
         """The channels and their delay as refits have them."""
-        found = set_last(model, Delayed, "delay")
-        names = " and ".join(repr(one.channel) for one in found)
-        start = f"Channel {names} acts" if len(found) == 1 else f"Channels {names} act"
-        return f"{start} with a dead time of {found[0].delay:.3g}{unit_of(evidence)}."
+        late = set_last(model, Delayed, "delay")
+        names = " and ".join(repr(channel.channel) for channel in late)
+        start = f"Channel {names} acts" if len(late) == 1 else f"Channels {names} act"
+        return f"{start} with a dead time of {late[0].delay:.3g}{unit_of(evidence)}."
 
     def refine(self, model: Model, record: Record, times: int) -> Sequence[Model]:
         """The delay a little shorter and longer, a sample or two at least."""
-        found = set_last(model, Delayed, "delay")
-        delay, step = found[0].delay, record.sampling_time
+        late = set_last(model, Delayed, "delay")
+        delay, step = late[0].delay, record.sampling_time
         near = {share * delay for share in FINER[times]}
         if record.is_regular:
             near |= {delay + k * step for k in (-2, -1, 1, 2)}
         return [
-            changed(model, found, delay=later) for later in resolved(near, record) if later != delay
+            changed(model, late, delay=later) for later in resolved(near, record) if later != delay
         ]
 
 
@@ -151,10 +134,10 @@ def _later(model: Model, names: Sequence[str], more: float, least: float) -> Mod
     """The model with inputs delayed by more than they are; None for less than the least delay."""
     for name in names:
         source, known = name, 0.0
-        for one in model.channels:
-            if isinstance(one, Delayed) and name in one.names:  # correct the delay it has
-                source, known = one.channel, one.delay
-                model = without_channel(model, one)
+        for channel in model.channels:
+            if isinstance(channel, Delayed) and name in channel.names:  # correct the delay it has
+                source, known = channel.channel, channel.delay
+                model = without_channel(model, channel)
         if known + more < least:
             return None
         model = with_channel(model, Delayed(source, known + more))

@@ -10,28 +10,19 @@ import numpy as np
 from pyro_dynogp.data.channels import DeadZone
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.effects.base import AROUND, FINER, Effect, changed, number_of
-from pyro_dynogp.effects.linear_responses import linear_responses
 from pyro_dynogp.models.variants import Model, with_channel
-from pyro_dynogp.statistics.detecting import (
-    NOTICED,
-    about,
-    binned,
-    evidence,
-    labelled,
-    lasting,
-    located_limits,
-    of_positive_weight,
-    unexplained,
-)
+from pyro_dynogp.statistics.detecting import Search, lasting, one_sided
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
+from pyro_dynogp.statistics.pictures import about, against, evidence
 from pyro_dynogp.statistics.regression import with_past
-from pyro_dynogp.statistics.shares_of_inputs import paths
+from pyro_dynogp.statistics.settings import LoopSettings
+from pyro_dynogp.statistics.shares_of_inputs import linear_responses, paths
 
 # Quantiles of an input between which a dead zone may lie.
 LEVELS = np.linspace(0.0, 1.0, 9)
 
 
-def dead_zone(residuals: Residuals, *, seed: int = 0) -> Evidence:
+def dead_zone(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> Evidence:
     """Test whether an input has no effect between two of its values.
 
     The column is the model's own path from that input, driven by dead zone less input. `where`:
@@ -39,7 +30,7 @@ def dead_zone(residuals: Residuals, *, seed: int = 0) -> Evidence:
     that far. An input with less than three values among its octiles is left out.
 
     Raises:
-        ValueError: where fewer than 30 samples are held out and measured, or all inputs are left
+        ValueError: where too few samples are held out and measured, or all inputs are left
             out.
     """
     r = residuals
@@ -63,25 +54,20 @@ def dead_zone(residuals: Residuals, *, seed: int = 0) -> Evidence:
             "residuals: expected an input of more than two values among its octiles, between which "
             f"a dead zone could lie; none of the {r.inputs.shape[1]} has them."
         )
-    found = of_positive_weight(lasting(r, variants, nuisance, seed))
-    j, low, high = tried[found.best]
-    if found.p_value < NOTICED:
+    scan = one_sided(lasting(r, variants, nuisance, settings, seed), variants)
+    j, low, high = tried[scan.best]
+    if scan.p_value < settings.noticed:
         at = np.unique(np.quantile(r.inputs[:, j], np.linspace(0.0, 1.0, 21)))
-        low, high = located_limits(r, lambda a, b: columns(j, [(a, b)]), (low, high), at, nuisance)
+        search = Search(r, nuisance, settings)
+        low, high = search.located_limits(lambda a, b: columns(j, [(a, b)]), (low, high), at)
     name = r.input_names[j]
     return evidence(
         "dead zone",
-        found,
+        scan,
         {"channel": name, "low": low, "high": high},
-        f"Channel '{name}' has no effect on '{r.output_name}' from {low:.3g} to {high:.3g}"
-        f"{about(r, found)}.",
-        binned(
-            r,
-            r.inputs[:, j],
-            unexplained(r, nuisance, found.fitted),
-            found.fitted,
-            (name, labelled("residual", r.output_unit)),
-        ),
+        f"Channel '{name}' has no effect on '{r.output_name}' from {low:.3g} to {high:.3g}, "
+        f"{about(r, scan.size)}.",
+        against(r, r.inputs[:, j], name, nuisance, scan.fitted),
     )
 
 

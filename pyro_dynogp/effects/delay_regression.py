@@ -37,15 +37,16 @@ def likely_delays(
     fixed = [np.ones((len(rows), 1)), lagged(output, range(1, PAST + 1))]
     fixed += [lagged(U[:, j], range(LAGS)) for j in others]
     start = np.concatenate(fixed, axis=1)
-    there = np.isfinite(start).all(1) & np.isfinite(output[rows])
-    if there.sum() < 4 * (PAST + LAGS * inputs.shape[1]):
+    measured = np.isfinite(start).all(1) & np.isfinite(output[rows])
+    if measured.sum() < 4 * (PAST + LAGS * inputs.shape[1]):
         return []
-    Q, _ = np.linalg.qr(start[there])
-    y = output[rows][there]
+    Q, _ = np.linalg.qr(start[measured])
+    y = output[rows][measured]
     y = y - Q @ (Q.T @ y)
     left = np.empty(most + 1)
     for d in range(most + 1):
-        X = np.concatenate([lagged(U[:, j], range(d, d + LAGS)) for j in delayed], axis=1)[there]
+        X = np.concatenate([lagged(U[:, j], range(d, d + LAGS)) for j in delayed], axis=1)
+        X = X[measured]
         X = X - Q @ (Q.T @ X)
         fit = X @ np.linalg.lstsq(X, y, rcond=1e-8)[0]
         left[d] = np.square(y - fit).sum()
@@ -64,4 +65,4 @@ def resolved(delays: Iterable[float], record: Record) -> list[float]:
     if not record.is_regular:
         return sorted(delays)
     step = record.sampling_time
-    return [step * count for count in sorted({max(round(one / step), 1) for one in delays})]
+    return [step * count for count in sorted({max(round(delay / step), 1) for delay in delays})]

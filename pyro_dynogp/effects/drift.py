@@ -11,10 +11,11 @@ from pyro_dynogp.data.channels import Trend, TrendOfGain
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.effects.base import Effect, centre_of
 from pyro_dynogp.models.variants import Model, with_channel, with_pairs, with_process_noise
-from pyro_dynogp.statistics.bootstrap import columns_score, replicates, sieve, spanning
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
+from pyro_dynogp.statistics.pictures import about, evidence, over_time
+from pyro_dynogp.statistics.prewhitening import free_columns, prewhitened, spanning
+from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.statistics.shares_of_inputs import paths
-from pyro_dynogp.statistics.time_pictures import over_time, size_in_words
 
 # Cosines of a drift: the slowest runs once from one end to the other, the fastest four times.
 SLOW = ((1,), (1, 2), (1, 2, 3, 4))
@@ -22,23 +23,18 @@ SLOW = ((1,), (1, 2), (1, 2, 3, 4))
 INPUTS = 4
 
 
-def drift(residuals: Residuals, *, seed: int = 0) -> Evidence:
+def drift(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> Evidence:
     """A slow change over the whole record, of the level or of a gain.
 
     The level changes by cosines of k half periods over the record, k = 1 to 4; a gain by the same
     cosines times the mean's deviation from its average, or times the share of one input.
 
-    Args:
-        residuals: of one output (n,). seed: of the replicates.
-
     Returns:
         where: form "additive" or "gain", channel (input or output whose gain drifts, "" for the
         level), time_scale (half a period of what dominates) [time unit].
 
-    Raises:
-        ValueError: where fewer than 30 samples are measured.
-
-    Source: slow cosines as in Müller & Watson, Econometrica 76(5):979 (2008); the null by `sieve`.
+    Source: slow cosines as in Müller & Watson, Econometrica 76(5):979 (2008); the null by
+    `prewhitened`.
     """
     r = residuals
     t = (r.time - r.time[0]) / (r.time[-1] - r.time[0])
@@ -55,35 +51,31 @@ def drift(residuals: Residuals, *, seed: int = 0) -> Evidence:
         scaled = [*scaled, *(shares - shares.mean(0)).T]
     K = slow.shape[1]
     columns = np.concatenate([slow * s[:, None] for s in scaled], axis=1)
-    variants = [np.array(k) - 1 + K * j for j in range(len(scaled)) for k in SLOW]
-    found = sieve(
+    places = [np.array(k) - 1 + K * j for j in range(len(scaled)) for k in SLOW]
+    scan = prewhitened(
         r.residual,
-        columns_score(columns, variants, spanning(nuisance), ~np.isfinite(r.residual)),
-        np.array([len(v) for v in variants]),
-        deviations=r.deviations,
+        free_columns(columns, places),
+        spanning(nuisance),
+        r.deviations,
+        settings,
         first=np.column_stack([columns, nuisance]),
-        replicates=replicates(len(r), columns.shape[1]),
         seed=seed,
     )
-    j, order = divmod(found.best, len(SLOW))
+    j, order = divmod(scan.best, len(SLOW))
     # What the fitted effect is as a function of time alone, and the cosine that dominates there.
     basis = slow[:, [k - 1 for k in SLOW[order]]] * scaled[j][:, None]
     joined = np.column_stack([basis, np.ones(len(r))])
-    weights = np.linalg.lstsq(joined, found.fitted, rcond=None)[0][:-1]
+    weights = np.linalg.lstsq(joined, scan.fitted, rcond=None)[0][:-1]
     k = float(np.square(weights) @ np.array(SLOW[order]) / max(np.square(weights).sum(), 1e-300))
     scale = float(r.time[-1] - r.time[0]) / max(k, 1.0)
     form = "gain" if names[j] else "additive"
     what = f"The gain of {names[j]!r}" if names[j] else f"The level of {r.output_name!r}"
-    return Evidence(
-        effect="drift",
-        statistic=found.statistic,
-        p_value=found.p_value,
-        gain=found.gain,
-        size=found.size,
-        where={"form": form, "channel": names[j], "time_scale": scale},
-        sentence=f"{what} drifts over about {scale:.3g} {r.time_unit}: "
-        f"{size_in_words(r, found.size)}.",
-        curve=over_time(r, found.fitted),
+    return evidence(
+        "drift",
+        scan,
+        {"form": form, "channel": names[j], "time_scale": scale},
+        f"{what} drifts over about {scale:.3g} {r.time_unit}: {about(r, scan.size)}.",
+        over_time(r, scan.fitted),
     )
 
 

@@ -11,18 +11,11 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.signals import held
 from pyro_dynogp.effects.base import Effect
 from pyro_dynogp.models.variants import Model, with_pairs
-from pyro_dynogp.statistics.detecting import (
-    NOTICED,
-    evidence,
-    labelled,
-    lasting,
-    located,
-    profiled,
-    regained,
-    unit,
-)
+from pyro_dynogp.statistics.detecting import Search, lasting, looked, regained
 from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
+from pyro_dynogp.statistics.pictures import about, evidence, labelled, unit
 from pyro_dynogp.statistics.responses import filtered, responses, standardised, time_constants
+from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.statistics.shares_of_inputs import check_inputs, looked_at
 
 # Damping ratio of the resonances that are tried: broad enough for a grid of twelve frequencies.
@@ -31,7 +24,7 @@ DAMPING, FREQUENCIES = 0.15, 12
 DAMPINGS = (0.02, 0.05, 0.1, 0.2, 0.4, 0.7)
 
 
-def unmodelled_dynamics(residuals: Residuals, *, seed: int = 0) -> Evidence:
+def unmodelled_dynamics(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> Evidence:
     """Test for linear responses of the used inputs beyond what the mean already is.
 
     Variants are the bank of first-order responses of each input, of all inputs together, and a
@@ -39,12 +32,9 @@ def unmodelled_dynamics(residuals: Residuals, *, seed: int = 0) -> Evidence:
     time_constant [time unit] of the resonance where that is the best variant (its time constant of
     decay); else the frequency of the largest coherence between the residual and the input that
     explains most, and the time constant of the first-order response of it that does.
-
-    Raises:
-        ValueError: where fewer than 30 samples are held out and measured.
     """
     check_inputs(residuals)
-    r = regained(residuals)
+    r = regained(residuals, settings)
     n_u = r.inputs.shape[1]
     banks = [responses(r.inputs[:, [j]], r.step, r.time) for j in range(n_u)]
     longest = 0.2 * (r.time[-1] - r.time[0])
@@ -57,34 +47,34 @@ def unmodelled_dynamics(residuals: Residuals, *, seed: int = 0) -> Evidence:
         tried.append((-1, np.nan))
         variants.append(np.column_stack(banks))
     nuisance = r.mean[:, None]
-    found = lasting(r, variants, nuisance, seed)
-    j, at = tried[found.best]
-    j = j if j >= 0 else int(np.argmax(found.gains[:n_u]))
+    scan, search = lasting(r, variants, nuisance, settings, seed), Search(r, nuisance, settings)
+    j, at = tried[scan.best]
+    j = j if j >= 0 else int(np.argmax(scan.gains[:n_u]))
     frequencies, coherence = _coherence(r, r.inputs[:, j])
     if np.isfinite(at):
         peak = at
-        if found.p_value < NOTICED:
-            peak = located(r, lambda w: _resonance(r, j, w, DAMPING), at, grid, nuisance)
+        if scan.p_value < settings.noticed:
+            peak = search.located(lambda w: _resonance(r, j, w, DAMPING), at, grid)
         damped = [_resonance(r, j, peak, z) for z in DAMPINGS]
-        gains = profiled(r, damped, nuisance, _resonance(r, j, peak, DAMPING))
+        gains = search.gains(damped, _resonance(r, j, peak, DAMPING))
         constant = 1.0 / (DAMPINGS[int(np.argmax(gains))] * peak)
     else:
         peak = float(frequencies[np.argmax(coherence)])
         constants = time_constants(r.step, r.time, 24)
         single = filtered(r.inputs[:, [j]], r.step, r.time, -1.0 / constants, 0)[:, 0, 1:]
         singles = list(standardised(single).T)
-        gains = profiled(r, singles, nuisance, banks[j])
+        gains = search.gains(singles, banks[j])
         constant = float(constants[np.argmax(gains)])
     blank = np.full(len(frequencies), np.nan)
     label = labelled("frequency", f"rad/{r.time_unit}" if r.time_unit else "")
     return evidence(
         "unmodelled dynamics",
-        found,
+        scan,
         {"frequency": peak, "time_constant": constant},
         f"'{r.output_name}' responds to channel '{r.input_names[j]}' by dynamics that the "
         f"model lacks (time constant about {constant:.2g}{unit(r.time_unit)}, frequency "
         f"{peak:.2g} rad{'/' + r.time_unit if r.time_unit else ''}), "
-        f"about {found.size:.2g}{unit(r.output_unit)} (rms).",
+        f"{about(r, scan.size)}.",
         Curve(frequencies, coherence, blank, label, f"coherence with {r.input_names[j]}"),
     )
 
@@ -103,7 +93,7 @@ def _coherence(residuals: Residuals, u: np.ndarray) -> tuple[np.ndarray, np.ndar
     Irregular samples are read at equal steps; missing ones count as zero, which lowers coherence.
     """
     r = residuals
-    e = np.where(r.held_out, r.residual, np.nan)
+    e = looked(r)
     e = np.nan_to_num(e - np.nanmean(e))
     at = np.arange(r.time[0], r.time[-1] + 0.5 * r.step, r.step)
     nearest = np.clip(np.searchsorted(r.time, at + 1e-6 * r.step, side="right") - 1, 0, len(e) - 1)

@@ -13,26 +13,15 @@ from pyro_dynogp.data.signals import delayed, held
 from pyro_dynogp.effects.base import Effect, centre_of, number_of
 from pyro_dynogp.effects.delay_regression import resolved
 from pyro_dynogp.models.variants import Model, with_channel
-from pyro_dynogp.statistics.detecting import (
-    NOTICED,
-    binned,
-    evidence,
-    labelled,
-    lasting,
-    located,
-    profiled,
-    unexplained,
-    unit,
-)
+from pyro_dynogp.statistics.detecting import Search, lasting
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
+from pyro_dynogp.statistics.pictures import about, against, evidence, unit
 from pyro_dynogp.statistics.responses import responses, standardised
-from pyro_dynogp.statistics.shares_of_inputs import own
-
-# A delay is named only where it gains as much [nats]: a parameter more must pay for itself.
-DELAY_GAIN = 3.0
+from pyro_dynogp.statistics.settings import LoopSettings
+from pyro_dynogp.statistics.shares_of_inputs import input_columns
 
 
-def extra_input(residuals: Residuals, *, seed: int = 0) -> list[Evidence]:
+def extra_input(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> list[Evidence]:
     """Test each recorded channel that the model does not use.
 
     The channel (linear), its square, its absolute value (both about its mean) and its products with
@@ -41,14 +30,11 @@ def extra_input(residuals: Residuals, *, seed: int = 0) -> list[Evidence]:
 
     Returns:
         One piece of evidence for each candidate.
-
-    Raises:
-        ValueError: where fewer than 30 samples are held out and measured.
     """
     if not residuals.candidates:
         return []
-    nuisance = own(residuals)
-    return [_extra(residuals, name, nuisance, seed) for name in residuals.candidates]
+    nuisance = input_columns(residuals)
+    return [_extra(residuals, name, nuisance, settings, seed) for name in residuals.candidates]
 
 
 def _forms(residuals: Residuals, name: str) -> dict[str, np.ndarray]:
@@ -62,7 +48,9 @@ def _forms(residuals: Residuals, name: str) -> dict[str, np.ndarray]:
     return forms
 
 
-def _extra(residuals: Residuals, name: str, nuisance: np.ndarray, seed: int) -> Evidence:
+def _extra(
+    residuals: Residuals, name: str, nuisance: np.ndarray, settings: LoopSettings, seed: int
+) -> Evidence:
     r = residuals
 
     def bank(form: np.ndarray, delay: float) -> np.ndarray:
@@ -73,31 +61,25 @@ def _extra(residuals: Residuals, name: str, nuisance: np.ndarray, seed: int) -> 
     longest = 0.1 * (r.time[-1] - r.time[0])
     coarse = np.concatenate([[0.0], np.geomspace(2.0 * r.step, longest, 4)])
     tried = [(f, d) for f in forms for d in (coarse[:1] if f.startswith("product") else coarse)]
-    found = lasting(r, [bank(forms[f], d) for f, d in tried], nuisance, seed)
-    form, delay = tried[found.best]
-    fitted = found.fitted
-    if found.p_value < NOTICED:
+    scan = lasting(r, [bank(forms[f], d) for f, d in tried], nuisance, settings, seed)
+    form, delay = tried[scan.best]
+    if scan.p_value < settings.noticed:
+        search = Search(r, nuisance, settings)
         grid = np.concatenate([[0.0], np.geomspace(0.5 * r.step, longest, 24)])
-        delay = located(r, lambda d: bank(forms[form], d), delay, grid, nuisance)
+        delay = search.located(lambda d: bank(forms[form], d), delay, grid)
         ways = [bank(forms[form], 0.0), bank(forms[form], delay)]
-        alone = profiled(r, ways, nuisance, ways[1])
+        alone = search.gains(ways, ways[1])
         # A filter's own lag is not a delay, and one that gains little is not worth a parameter.
-        delay = delay if alone[1] - alone[0] > DELAY_GAIN and delay >= r.step else 0.0
+        delay = delay if alone[1] - alone[0] > settings.preference and delay >= r.step else 0.0
     late = f", {delay:.3g}{unit(r.time_unit)} later" if delay else ""
     how = {"linear": "", "square": " by its square", "absolute": " by its absolute value"}
     return evidence(
         "extra input",
-        found,
+        scan,
         {"channel": name, "form": form, "delay": delay},
         f"Channel '{name}' acts on '{r.output_name}'{how.get(form, f' as {form}')}{late}, "
-        f"about {found.size:.2g}{unit(r.output_unit)} (rms).",
-        binned(
-            r,
-            delayed(held(r.candidates[name]), r.time, delay),
-            unexplained(r, nuisance, fitted),
-            fitted,
-            (name, labelled("residual", r.output_unit)),
-        ),
+        f"{about(r, scan.size)}.",
+        against(r, delayed(held(r.candidates[name]), r.time, delay), name, nuisance, scan.fitted),
     )
 
 

@@ -12,24 +12,21 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.effects.base import Effect, number_of
 from pyro_dynogp.layers.noise import StudentT
 from pyro_dynogp.models.variants import Model, with_likelihood
-from pyro_dynogp.statistics.autoregression import fitted_filter
+from pyro_dynogp.statistics.autoregression import check_samples, fitted_filter
+from pyro_dynogp.statistics.bootstrap import batches, tail_probability
 from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
-from pyro_dynogp.statistics.scan import tail_probability
-from pyro_dynogp.statistics.serial import REPLICATES, held_out_innovations, one_step_sd
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.statistics.serial import held_out_innovations, one_step_sd
+from pyro_dynogp.statistics.settings import LoopSettings
 
 # Degrees of freedom that are looked through; beyond the last a Student-t is normal.
 LOWEST, HIGHEST = 1.0, 200.0
 
 
-def heavy_tails(residuals: Residuals, *, seed: int = 0) -> Evidence:
+def heavy_tails(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> Evidence:
     """More outliers than normal noise has, in the held-out one-step errors.
 
     The statistic is their excess kurtosis, whitened once more, over its standard deviation under
     normal noise: locally the most powerful one against Student-t noise. Its null is simulated.
-
-    Args:
-        residuals: of one output (n,). seed: of the simulated null.
 
     Returns:
         where: degrees_of_freedom of the Student-t distribution of largest likelihood, outliers:
@@ -37,35 +34,32 @@ def heavy_tails(residuals: Residuals, *, seed: int = 0) -> Evidence:
         is that of the Student-t over the normal distribution; size is the outliers' part of the
         one-step error [output].
 
-    Raises:
-        ValueError: where fewer than 30 held-out samples are measured.
-
     Source: kurtosis test as in D'Agostino & Pearson, Biometrika 60(3):613 (1973), by simulation.
     """
     r = residuals
-    v = held_out_innovations(r)
-    w = fitted_filter(v)(v)
+    v = held_out_innovations(r, settings)
+    w = fitted_filter(v, settings)(v)
     w = w[np.isfinite(w)]
-    if len(w) < 30:
-        raise invalid("residuals", expected="30 innovations beside gaps", got=str(len(w)))
+    check_samples(len(w), settings, "innovations beside gaps")
     w = (w - w.mean()) / w.std()
-    # As many as a batch holds: their memory grows with the record.
-    null = stats.kurtosis(
-        np.random.default_rng(seed).standard_normal((REPLICATES, len(w)), dtype=np.float32), axis=1
-    )
+
+    def drawn(generator: np.random.Generator, size: int) -> np.ndarray:
+        return stats.kurtosis(generator.standard_normal((size, len(w))), axis=1)
+
+    null = np.concatenate(list(batches(drawn, settings.replicates, seed)))
     statistic = float((stats.kurtosis(w) - null.mean()) / null.std())
     freedom, location, scale, gain = student_t(w)
     robust = 1.4826 * float(np.median(np.abs(w - np.median(w))))
-    limit = float(stats.norm.isf(0.025 / len(w)))
+    limit = float(stats.norm.isf(0.5 * settings.outlier / len(w)))
     far = np.abs(w - np.median(w)) > limit * robust
     probability = (np.arange(len(w)) + 0.5) / len(w)
     count = int(far.sum())
     return Evidence(
         effect="heavy tails",
         statistic=statistic,
-        p_value=tail_probability((null - null.mean()) / null.std(), statistic),
+        p_value=tail_probability((null - null.mean()) / null.std(), statistic, settings),
         gain=gain,
-        size=one_step_sd(r) * float(np.sqrt(np.square(w[far]).sum() / len(w))),
+        size=one_step_sd(r, settings) * float(np.sqrt(np.square(w[far]).sum() / len(w))),
         where={"degrees_of_freedom": freedom, "outliers": float(count)},
         sentence=f"One-step errors of {r.output_name!r} have heavier tails than normal ones: "
         f"Student-t with {freedom:.2g} degrees of freedom; {count} of {len(w)} are outliers beyond "
@@ -109,10 +103,10 @@ def student_t(w: np.ndarray) -> tuple[float, float, float, float]:
         return float(stats.t.logpdf(w, nu, at, scale).sum())
 
     bounds = (np.log(LOWEST), np.log(HIGHEST))
-    found = minimize_scalar(lambda x: -log_density(x), bounds=bounds, method="bounded")
-    nu = float(np.exp(found.x))
+    optimum = minimize_scalar(lambda x: -log_density(x), bounds=bounds, method="bounded")
+    nu = float(np.exp(optimum.x))
     normal = float(stats.norm.logpdf(w, w.mean(), w.std()).sum())
-    return nu, *located(nu), max(-float(found.fun) - normal, 0.0)
+    return nu, *located(nu), max(-float(optimum.fun) - normal, 0.0)
 
 
 class HeavyTails(Effect):

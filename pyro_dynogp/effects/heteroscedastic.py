@@ -11,16 +11,20 @@ from pyro_dynogp.data.signals import held
 from pyro_dynogp.effects.base import Effect
 from pyro_dynogp.layers.noise import Driver, Heteroscedastic
 from pyro_dynogp.models.variants import Model, with_likelihood
-from pyro_dynogp.statistics.bootstrap import columns_score, replicates, sieve, spanning
-from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
+from pyro_dynogp.statistics.evidence import Evidence, Residuals
+from pyro_dynogp.statistics.pictures import binned, evidence, labelled
+from pyro_dynogp.statistics.prewhitening import free_columns, prewhitened, spanning
 from pyro_dynogp.statistics.responses import filtered
 from pyro_dynogp.statistics.serial import held_out_innovations, one_step_sd
+from pyro_dynogp.statistics.settings import LoopSettings
 
 # Slow responses that may drive the size of the noise [steps].
 MEMORY = (4.0, 16.0)
 
 
-def heteroscedastic_noise(residuals: Residuals, *, seed: int = 0) -> Evidence:
+def heteroscedastic_noise(
+    residuals: Residuals, settings: LoopSettings, *, seed: int = 0
+) -> Evidence:
     """Noise whose size depends on an input, on the mean or on time.
 
     The size of the held-out one-step errors is regressed on each driver d: d and |d - median|,
@@ -29,21 +33,15 @@ def heteroscedastic_noise(residuals: Residuals, *, seed: int = 0) -> Evidence:
     logarithm of the square 40 %, and outliers do not carry it. Sizes that only cluster in time, as
     in autoregressive conditional heteroscedasticity, are the colour of the size, and no driver.
 
-    Args:
-        residuals: of one output (n,). seed: of the replicates.
-
     Returns:
         where: driver (an input's name, "mean" or "time"). size: standard deviation over the record
         of the one-step error's standard deviation [output].
 
-    Raises:
-        ValueError: where fewer than 30 held-out samples are measured.
-
     Source: Glejser, JASA 64(325):316 (1969); efficiencies: Davidian & Carroll, JASA 82(400):1079
-    (1987). The null: `sieve`.
+    (1987). The null: `prewhitened`.
     """
     r = residuals
-    v = held_out_innovations(r)
+    v = held_out_innovations(r, settings)
     y = np.abs(v - np.nanmean(v))
     names, variants = list[str](), list[np.ndarray]()
     for name, driver in [*zip(r.input_names, r.inputs.T, strict=True), ("mean", r.mean)]:
@@ -61,53 +59,35 @@ def heteroscedastic_noise(residuals: Residuals, *, seed: int = 0) -> Evidence:
     columns = np.column_stack(variants)
     columns = columns - columns.mean(0)
     ends = np.cumsum([v.shape[1] for v in variants])
-    found = sieve(
+    places = [np.arange(b - v.shape[1], b) for v, b in zip(variants, ends, strict=True)]
+    scan = prewhitened(
         y,
-        columns_score(
-            columns,
-            [np.arange(b - v.shape[1], b) for v, b in zip(variants, ends, strict=True)],
-            spanning(columns[:, :0]),
-            ~np.isfinite(y),
-        ),
-        np.array([v.shape[1] for v in variants]),
+        free_columns(columns, places),
+        spanning(columns[:, :0]),
+        r.deviations[:0],
+        settings,
         first=columns if columns.shape[1] < np.isfinite(y).sum() // 5 else cosines,
-        replicates=replicates(len(r), columns.shape[1]),
         seed=seed,
     )
-    name = names[found.best]
+    name = names[scan.best]
     average = float(np.nanmean(y))
-    level = np.maximum(average + found.fitted, 0.05 * average)
+    level = np.maximum(average + scan.fitted, 0.05 * average)
     low, high = np.quantile(level[np.isfinite(y)], [0.05, 0.95])
-    unit = one_step_sd(r) / average
-    shown = r.time if name == "time" else variants[found.best][:, 0]
-    label = name if name == "time" else f"{name}, as it acts"
-    what = "the mean" if name == "mean" else name if name == "time" else repr(name)
-    return Evidence(
-        effect="heteroscedastic noise",
-        statistic=found.statistic,
-        p_value=found.p_value,
-        gain=found.gain,
-        size=unit * found.size,
-        where={"driver": name},
-        sentence=f"The noise of {r.output_name!r} depends on {what}: its standard deviation varies "
-        f"by a factor of {high / low:.2g} (5 to 95 % of the samples).",
-        curve=_by_level(shown, unit * y, unit * level, label, r),
+    unit = one_step_sd(r, settings) / average
+    shown = r.time if name == "time" else variants[scan.best][:, 0]
+    axes = (
+        name if name == "time" else f"{name}, as it acts",
+        labelled(f"standard deviation of the noise of {r.output_name}", r.output_unit),
     )
-
-
-def _by_level(
-    x: np.ndarray, y: np.ndarray, fitted: np.ndarray, label: str, r: Residuals, bins: int = 20
-) -> Curve:
-    """Size of the noise, averaged in bins of equal count of what drives it."""
-    known = np.flatnonzero(np.isfinite(y))
-    parts = np.array_split(known[np.argsort(x[known], kind="stable")], bins)
-    parts = [p for p in parts if len(p)]
-    return Curve(
-        x=np.array([x[p].mean() for p in parts]),
-        y=np.array([y[p].mean() for p in parts]),
-        fitted=np.array([fitted[p].mean() for p in parts]),
-        x_label=label,
-        y_label=f"standard deviation of the noise of {r.output_name} [{r.output_unit}]",
+    what = "the mean" if name == "mean" else name if name == "time" else repr(name)
+    return evidence(
+        "heteroscedastic noise",
+        scan,
+        {"driver": name},
+        f"The noise of {r.output_name!r} depends on {what}: its standard deviation varies "
+        f"by a factor of {high / low:.2g} (5 to 95 % of the samples).",
+        binned(r, shown, unit * y, unit * level, axes, bins=20),
+        unit * scan.size,
     )
 
 

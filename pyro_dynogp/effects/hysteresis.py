@@ -10,36 +10,25 @@ from pyro_dynogp.data.channels import Play
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.signals import play
 from pyro_dynogp.effects.base import AROUND, Effect, finer, number_of
-from pyro_dynogp.effects.linear_responses import linear_responses
 from pyro_dynogp.models.variants import Model, with_channel
-from pyro_dynogp.statistics.detecting import (
-    NOTICED,
-    about,
-    evidence,
-    labelled,
-    lasting,
-    located,
-    of_positive_weight,
-    unit,
-)
+from pyro_dynogp.statistics.detecting import Search, lasting, one_sided
 from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
+from pyro_dynogp.statistics.pictures import about, evidence, labelled, unit
 from pyro_dynogp.statistics.regression import with_past
-from pyro_dynogp.statistics.shares_of_inputs import paths
+from pyro_dynogp.statistics.settings import LoopSettings
+from pyro_dynogp.statistics.shares_of_inputs import linear_responses, paths
 
 # Widths of play that are tried, against the range of the signal.
 WIDTHS = np.geomspace(0.02, 0.8, 10)
 
 
-def hysteresis(residuals: Residuals, *, seed: int = 0) -> Evidence:
+def hysteresis(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> Evidence:
     """Test for play (backlash) at an input or at the output.
 
     Columns: the model's own path driven by play(u_j, width) - u_j, and play(mean, width) - mean.
     A phase lag, which differs from play in that it depends on frequency, is left to the responses
     of the inputs. `where`: channel (the output's name for play there), width (full, of that
     channel's unit).
-
-    Raises:
-        ValueError: where fewer than 30 samples are held out and measured.
     """
     r = residuals
     path = paths(r)
@@ -55,24 +44,24 @@ def hysteresis(residuals: Residuals, *, seed: int = 0) -> Evidence:
     ranges = [float(np.ptp(np.quantile(s, [0.01, 0.99]))) for s in signals]
     tried = [(j, k) for j in range(len(signals)) for k in range(len(WIDTHS))]
     variants = [with_past(c) for j in range(len(signals)) for c in columns(j, WIDTHS * ranges[j]).T]
-    found = of_positive_weight(lasting(r, variants, nuisance, seed))
-    j, k = tried[found.best]
+    scan = one_sided(lasting(r, variants, nuisance, settings, seed), variants)
+    j, k = tried[scan.best]
     width = float(WIDTHS[k] * ranges[j])
-    if found.p_value < NOTICED:
-        grid = WIDTHS * ranges[j]
-        width = located(r, lambda w: columns(j, np.array([w])), width, grid, nuisance)
-    own_gains = found.gains[[i for i, t in enumerate(tried) if t[0] == j]]
+    if scan.p_value < settings.noticed:
+        search = Search(r, nuisance, settings)
+        width = search.located(lambda w: columns(j, np.array([w])), width, WIDTHS * ranges[j])
+    gains = scan.gains[[i for i, t in enumerate(tried) if t[0] == j]]
     of = unit(r.output_unit) if j == len(signals) - 1 else ""
     label = labelled(f"width of the play of {names[j]}", of.strip())
     return evidence(
         "hysteresis",
-        found,
+        scan,
         {"channel": names[j], "width": width},
-        f"'{r.output_name}' follows channel '{names[j]}' with play, {width:.3g}{of} wide"
-        f"{about(r, found)}."
+        f"'{r.output_name}' follows channel '{names[j]}' with play, {width:.3g}{of} wide, "
+        f"{about(r, scan.size)}."
         if j < len(signals) - 1
-        else f"'{r.output_name}' has play, {width:.3g}{of} wide{about(r, found)}.",
-        Curve(WIDTHS * ranges[j], own_gains, np.full(len(WIDTHS), np.nan), label, "gain [nats]"),
+        else f"'{r.output_name}' has play, {width:.3g}{of} wide, {about(r, scan.size)}.",
+        Curve(WIDTHS * ranges[j], gains, np.full(len(WIDTHS), np.nan), label, "gain [nats]"),
     )
 
 

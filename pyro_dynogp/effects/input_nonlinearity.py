@@ -9,24 +9,22 @@ import numpy as np
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.signals import hermite, hinges
 from pyro_dynogp.effects.base import Effect
-from pyro_dynogp.effects.linear_responses import linear_responses
 from pyro_dynogp.models.variants import Model, with_input_function
-from pyro_dynogp.statistics.detecting import about, binned, evidence, labelled, lasting, unexplained
+from pyro_dynogp.statistics.detecting import lasting
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
+from pyro_dynogp.statistics.pictures import about, against, evidence
 from pyro_dynogp.statistics.regression import with_past
 from pyro_dynogp.statistics.responses import responses
-from pyro_dynogp.statistics.shares_of_inputs import paths
+from pyro_dynogp.statistics.settings import LoopSettings
+from pyro_dynogp.statistics.shares_of_inputs import linear_responses, paths
 
 
-def input_nonlinearity(residuals: Residuals, *, seed: int = 0) -> Evidence:
+def input_nonlinearity(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> Evidence:
     """Test for responses of even and odd functions of each used input, beyond those of itself.
 
     The functions (Hermite polynomials, piecewise linear ones) go through the model's own path from
     that input, and the polynomials through a bank of filters as well (after the cross-correlations
     with squared inputs of Billings and Voon, Int. J. Control 44:235, 1986). `where`: channel.
-
-    Raises:
-        ValueError: where fewer than 30 samples are held out and measured.
     """
     r = residuals
     path = paths(r)
@@ -38,17 +36,16 @@ def input_nonlinearity(residuals: Residuals, *, seed: int = 0) -> Evidence:
         banks = [responses(powers[:, i], r.step, r.time, constants=4, lags=1) for i in (0, 1)]
         ways = [through[:, :1], through[:, 1:2], through[:, :2], through[:, 2:]]
         tried += [(j, way) for way in [*map(with_past, ways), *banks]]
-    found = lasting(r, [columns for _, columns in tried], nuisance, seed)
-    j = tried[found.best][0]
+    scan = lasting(r, [columns for _, columns in tried], nuisance, settings, seed)
+    j = tried[scan.best][0]
     name = r.input_names[j]
-    axes = (name, labelled("residual", r.output_unit))
     return evidence(
         "input nonlinearity",
-        found,
+        scan,
         {"channel": name},
-        f"Channel '{name}' acts on '{r.output_name}' through a nonlinear function of itself"
-        f"{about(r, found)}.",
-        binned(r, r.inputs[:, j], unexplained(r, nuisance, found.fitted), found.fitted, axes),
+        f"Channel '{name}' acts on '{r.output_name}' through a nonlinear function of itself, "
+        f"{about(r, scan.size)}.",
+        against(r, r.inputs[:, j], name, nuisance, scan.fitted),
     )
 
 

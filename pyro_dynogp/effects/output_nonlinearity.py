@@ -9,36 +9,32 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.signals import hermite, hinges
 from pyro_dynogp.effects.base import Effect
 from pyro_dynogp.models.variants import Model, with_output_function
-from pyro_dynogp.statistics.detecting import about, binned, evidence, labelled, lasting, unexplained
+from pyro_dynogp.statistics.detecting import lasting
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
+from pyro_dynogp.statistics.pictures import about, against, evidence, labelled
 from pyro_dynogp.statistics.regression import with_past
+from pyro_dynogp.statistics.settings import LoopSettings
 
 
-def output_nonlinearity(residuals: Residuals, *, seed: int = 0) -> Evidence:
+def output_nonlinearity(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> Evidence:
     """Test for a function of the mean alone, beyond the mean itself.
 
     Variants: Hermite polynomials of the second and third degree, apart and together, and piecewise
     linear functions with one knot and with five (after Ramsey's RESET, J. R. Stat. Soc. B 31:350,
     1969). `where` is empty.
-
-    Raises:
-        ValueError: where fewer than 30 samples are held out and measured.
     """
     r = residuals
     powers, bends = hermite(r.mean), hinges(r.mean)
     variants = [powers[:, :1], powers[:, 1:], powers, bends, *bends.T]
     variants, nuisance = [with_past(v) for v in variants], with_past(r.mean)
-    found = lasting(r, variants, nuisance, seed)
-    axes = (
-        labelled(f"simulated {r.output_name}", r.output_unit),
-        labelled("residual", r.output_unit),
-    )
+    scan = lasting(r, variants, nuisance, settings, seed)
+    label = labelled(f"simulated {r.output_name}", r.output_unit)
     return evidence(
         "output nonlinearity",
-        found,
+        scan,
         {},
-        f"'{r.output_name}' is a nonlinear function of what the model says{about(r, found)}.",
-        binned(r, r.mean, unexplained(r, nuisance, found.fitted), found.fitted, axes),
+        f"'{r.output_name}' is a nonlinear function of what the model says, {about(r, scan.size)}.",
+        against(r, r.mean, label, nuisance, scan.fitted),
     )
 
 

@@ -7,17 +7,17 @@ from scipy.fft import fft, rfft
 from scipy.optimize import minimize_scalar
 from scipy.stats import chi2
 
-from pyro_dynogp.statistics.bootstrap import (
-    Prepare,
+from pyro_dynogp.statistics.autoregression import Whitener
+from pyro_dynogp.statistics.evidence import Residuals
+from pyro_dynogp.statistics.prewhitening import (
+    Projection,
     Score,
     Scored,
-    explained_by,
+    Variants,
     log_ratio,
-    projector,
     spanning,
 )
-from pyro_dynogp.statistics.evidence import Residuals
-from pyro_dynogp.statistics.whitening import Whitener
+from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.support.errors import invalid
 
 HARMONICS = 4
@@ -37,22 +37,19 @@ def slots(r: Residuals) -> np.ndarray:
     return at
 
 
-def lines(bins: np.ndarray, length: int, nuisance: np.ndarray, missing: np.ndarray) -> Prepare:
-    """Score of sines at frequencies bins / length [1 / step]: all by one Fourier transform.
+def lines(bins: np.ndarray, length: int, settings: LoopSettings) -> Variants:
+    """Sines at frequencies bins / length [1 / step]: all by one Fourier transform.
 
     A filter makes of a sine a sine of the same frequency, so both span the same, and the
     residual's own past stands beside it as more columns of nuisance.
     """
 
-    def prepare(whiten: Whitener) -> Score:
-        p, n = whiten.order, len(missing)
-        there = ~missing
-        for k in range(1, p + 1):
-            there[k:] &= ~missing[: n - k]
-            there[:k] = False
-        rows = np.flatnonzero(there)
+    def prepare(under: Projection) -> Score:
+        p, n, nuisance = under.whiten.order, len(under.missing), under.nuisance
+        rows = np.flatnonzero(under.rows) + p
         beside = spanning(nuisance[rows])
-        mask = there.astype(float)
+        mask = np.zeros(n)
+        mask[rows] = 1.0
         double = fft(mask, length)[(2 * bins) % length]
 
         def parts(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -81,14 +78,15 @@ def lines(bins: np.ndarray, length: int, nuisance: np.ndarray, missing: np.ndarr
             def fit(j: int) -> tuple[np.ndarray, np.ndarray]:
                 line = _wave(n, bins[j] / length)
                 design = np.column_stack([*past, line[rows], nuisance[rows]])
-                own_filter = Whitener(np.linalg.lstsq(design, x[rows], rcond=1e-9)[0][:p])
-                return explained_by(own_filter, there[p:], line, nuisance, x)
+                noise = Whitener(np.linalg.lstsq(design, x[rows], rcond=1e-9)[0][:p])
+                beside_line = Projection(noise, nuisance, under.missing, settings)
+                return beside_line.with_nuisance(beside_line.fit(line, x), x)
 
             return gains, fit
 
         return score
 
-    return prepare
+    return Variants(prepare, np.full(len(bins), 2.0), joint=True)
 
 
 def _sine(n: int, frequency: float) -> np.ndarray:
@@ -110,17 +108,12 @@ def _wave(n: int, frequency: float) -> np.ndarray:
     return np.column_stack([*waves, *(shift * wave for wave in waves if inside)])
 
 
-def refined(
-    whiten: Whitener, x: np.ndarray, nuisance: np.ndarray, frequency: float, width: float
-) -> float:
+def refined(under: Projection, x: np.ndarray, frequency: float, width: float) -> float:
     """Frequency of largest gain within `width` of one on the grid [1 / step]."""
-    there, Q, _ = projector(whiten, nuisance, ~np.isfinite(x))
-    e = whiten(x)[there]
-    e = e - Q @ (Q.T @ e)
+    e = under(x)
 
     def left(f: float) -> float:
-        w = whiten(_sine(len(x), f))[there]
-        w = w - Q @ (Q.T @ w)
+        w = under(_sine(len(x), f))
         return -float(e @ w @ np.linalg.lstsq(w, e, rcond=1e-9)[0])
 
     bounds = (max(frequency - width, 0.1 / len(x)), min(frequency + width, 0.5))
@@ -128,26 +121,25 @@ def refined(
 
 
 def harmonics(
-    whiten: Whitener, x: np.ndarray, nuisance: np.ndarray, frequency: float
+    under: Projection, x: np.ndarray, frequency: float, level: float
 ) -> tuple[np.ndarray, list[int]]:
-    """The sine with those harmonics that explain more at 1 % (n,), and which they are."""
-    there = np.isfinite(whiten(x))
+    """The sine with those harmonics that the data are certain of (n,), and which they are."""
     columns, also, n = _sine(len(x), frequency), list[int](), len(x)
+    e = under(x)
 
     def total(columns: np.ndarray) -> float:
-        joined = whiten(np.column_stack([columns, nuisance]))[there]
-        e = whiten(x)[there]
-        return float(np.square(e - joined @ np.linalg.lstsq(joined, e, rcond=1e-9)[0]).sum())
+        w = under(columns)
+        return float(np.square(e - w @ np.linalg.lstsq(w, e, rcond=1e-9)[0]).sum())
 
-    known, last = int(there.sum()), total(columns)
+    last = total(columns)
     for h in range(2, HARMONICS + 1):
         if h * frequency >= 0.5:
             break
         more = np.column_stack([columns, _sine(n, h * frequency)])
         left = total(more)
-        if chi2.sf(known * np.log(max(last, 1e-300) / max(left, 1e-300)), 2) < 0.01 / (
-            HARMONICS - 1
-        ):
+        gain = len(e) * np.log(max(last, 1e-300) / max(left, 1e-300))
+        if chi2.sf(gain, 2) < level / (HARMONICS - 1):
             columns, last = more, left
             also.append(h)
-    return explained_by(whiten, there, columns, nuisance, x)[0], also
+    effect = under.fit(columns, x)
+    return effect - effect.mean(), also

@@ -12,32 +12,27 @@ from pyro_dynogp.models.variants import Model, has_process_noise, with_pairs, wi
 from pyro_dynogp.statistics.autoregression import fitted_filter
 from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
 from pyro_dynogp.statistics.serial import held_out_innovations, one_step_sd, portmanteau
+from pyro_dynogp.statistics.settings import LoopSettings
 
 
-def process_noise(residuals: Residuals, *, seed: int = 0) -> Evidence:
+def process_noise(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> Evidence:
     """Disturbances that pass through dynamics: autocorrelated held-out one-step errors.
 
     Their null keeps their sizes in place, so that heteroscedastic noise does not look coloured.
-
-    Args:
-        residuals: of one output (n,). seed: of the random signs.
 
     Returns:
         where: time_constant of an autocorrelation c exp(-lag / time_constant) [time unit], zero
         where neighbours differ in sign. size: what the past tells of the one-step error [output].
 
-    Raises:
-        ValueError: where fewer than 30 held-out samples are measured.
-
     Source: `portmanteau`.
     """
     r = residuals
-    v = held_out_innovations(r)
-    statistic, p_value, window, rho = portmanteau(v, seed, signs=True)
+    v = held_out_innovations(r, settings)
+    statistic, p_value, window, rho = portmanteau(v, settings, seed, signs=True)
     gain = 0.5 * float(np.isfinite(v).sum()) * float(np.square(rho[:window]).sum())
     decay, amplitude = _decay(rho)
     constant = -r.step / np.log(decay) if decay > 0 else 0.0
-    whiten = fitted_filter(v)
+    whiten = fitted_filter(v, settings)
     left = float(np.nanvar(whiten(v)) / max(np.nanvar(v), 1e-300))
     known = f"; their autocorrelation decays with a time constant of {constant:.3g} {r.time_unit}"
     lags = np.arange(1, len(rho) + 1)
@@ -46,7 +41,7 @@ def process_noise(residuals: Residuals, *, seed: int = 0) -> Evidence:
         statistic=statistic,
         p_value=p_value,
         gain=gain,
-        size=one_step_sd(r) * float(np.sqrt(max(1.0 - left, 0.0))),
+        size=one_step_sd(r, settings) * float(np.sqrt(max(1.0 - left, 0.0))),
         where={"time_constant": float(constant)},
         sentence=f"One-step errors of {r.output_name!r} depend on earlier ones ({rho[0]:.2f} with "
         f"the one before){known if decay > 0 else ''}.",

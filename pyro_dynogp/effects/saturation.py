@@ -8,95 +8,69 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from scipy import stats
-from scipy.signal import lfilter
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.effects.base import Effect, Parameters, number_of
 from pyro_dynogp.models.variants import Model, with_output_function
 from pyro_dynogp.models.wiring import Static
 from pyro_dynogp.statistics.autoregression import fitted_filter
-from pyro_dynogp.statistics.detecting import (
-    NOTICED,
-    about,
-    binned,
-    evidence,
-    labelled,
-    lasting,
-    located_limits,
-    of_positive_weight,
-    unit,
-)
+from pyro_dynogp.statistics.bootstrap import noise_of, tail_probability
+from pyro_dynogp.statistics.detecting import Search, lasting, one_sided
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
-from pyro_dynogp.statistics.regression import with_past
-from pyro_dynogp.statistics.scan import tail_probability
+from pyro_dynogp.statistics.pictures import about, binned, evidence, labelled, unit
+from pyro_dynogp.statistics.regression import solve, with_past
+from pyro_dynogp.statistics.settings import LoopSettings
 
 if TYPE_CHECKING:
     from pyro_dynogp.fitting import Fit
 
-# Exact ties as improbable as this are a limit, and name it.
-TIED = 0.01
-# Largest slope beyond a limit, as a share of that before it: what goes on rising is no limit.
-FLAT = 0.3
 # Quantiles of the mean above which it may flatten; below, their complements.
 UPPER = np.array([0.5, 0.6, 0.7, 0.8, 0.9, 0.95])
 # Values as near as this to each other, against the range, are the same number.
 SAME = 1e-9
 
 
-def saturation(residuals: Residuals, *, seed: int = 0) -> Evidence:
+def saturation(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> Evidence:
     """Test whether the output stops at an upper or a lower limit.
 
     Two signs, of which either does: exact ties at the largest or smallest measured value (see
-    `ties_at_the_top`), and an output that flattens where the mean goes on: to less than 0.3 of its
-    slope, or it is another nonlinearity. `where`: low, high [output], infinite where there is none.
-
-    Raises:
-        ValueError: where fewer than 30 samples are held out and measured.
+    `ties_at_the_top`), and an output that flattens where the mean goes on: to less than a share
+    `flat` of its slope, or it is another nonlinearity. `where`: low, high [output], infinite where
+    there is none.
     """
     r = residuals
-    top = ties_at_the_top(r.output, r.mean, seed=seed)
-    bottom = ties_at_the_top(-r.output, -r.mean, seed=seed)
+    top = ties_at_the_top(r.output, r.mean, settings, seed=seed)
+    bottom = ties_at_the_top(-r.output, -r.mean, settings, seed=seed)
     bottom = replace(bottom, limit=-bottom.limit)
     tied = min(1.0, 2.0 * min(top.p_value, bottom.p_value))
     knots = _knots(r.mean)
-    found = of_positive_weight(
-        lasting(r, [_clipped(r.mean, *k) for k in knots], with_past(r.mean), seed)
-    )
+    variants = [with_past(np.clip(r.mean, *at) - r.mean) for at in knots]
+    scan = one_sided(lasting(r, variants, with_past(r.mean), settings, seed), variants)
     # Two tests where values tie at all; two equal ones out of many may be chance.
-    p = min(1.0, 2.0 * min(tied, found.p_value)) if tied < 1.0 else found.p_value
-    if tied <= found.p_value or tied < TIED:
-        low = bottom.limit if bottom.p_value < TIED or bottom.p_value < top.p_value else -np.inf
-        high = top.limit if top.p_value < TIED or top.p_value <= bottom.p_value else np.inf
+    p = min(1.0, 2.0 * min(tied, scan.p_value)) if tied < 1.0 else scan.p_value
+    statistic, gain, size = scan.statistic, scan.gain, scan.size
+    if tied <= scan.p_value or tied < settings.tied:
+        at_bottom, at_top = (end.p_value < settings.tied for end in (bottom, top))
+        low = bottom.limit if at_bottom or bottom.p_value < top.p_value else -np.inf
+        high = top.limit if at_top or top.p_value <= bottom.p_value else np.inf
         gain = -float(np.log(max(tied, 1e-300)))
-        found = replace(
-            found,
-            statistic=(2.0 * gain - 1.0) / np.sqrt(2.0),
-            gain=gain,
-            size=_cut(top, bottom, low, high),
-        )
+        statistic, size = (2.0 * gain - 1.0) / np.sqrt(2.0), _cut(top, bottom, low, high)
         counts = [str(t.count) for t, at in ((bottom, low), (top, high)) if np.isfinite(at)]
         how = f" ({' and '.join(counts)} samples at exactly that value)"
     else:
-        low, high, slope = _flat_limits(r, knots[found.best], p < NOTICED)
-        p = 1.0 if p < NOTICED and slope > FLAT else p
+        noticed = p < settings.noticed
+        low, high, slope = _flat_limits(r, knots[scan.best], noticed, settings)
+        p = 1.0 if noticed and slope > settings.flat else p
         how = ""
     limits = [f"{at:.4g}{unit(r.output_unit)}" for at in (low, high) if np.isfinite(at)]
-    flattened = np.clip(r.mean, low, high)
+    label = labelled(r.output_name, r.output_unit)
     return evidence(
         "saturation",
-        replace(found, p_value=p),
+        replace(scan, statistic=statistic, p_value=p, gains=np.array([gain]), best=0),
         {"low": low, "high": high},
-        f"'{r.output_name}' stops at {' and '.join(limits)}{how}{about(r, found)}.",
-        binned(
-            r,
-            r.mean,
-            r.output,
-            flattened,
-            (
-                labelled(f"simulated {r.output_name}", r.output_unit),
-                labelled(r.output_name, r.output_unit),
-            ),
-        ),
+        f"'{r.output_name}' stops at {' and '.join(limits)}{how}, {about(r, size)}.",
+        binned(r, r.mean, r.output, np.clip(r.mean, low, high), (f"simulated {label}", label)),
+        size,
     )
 
 
@@ -109,12 +83,8 @@ def _knots(mean: np.ndarray) -> list[tuple[float, float]]:
     return [*above, *below, *both]
 
 
-def _clipped(mean: np.ndarray, low: float, high: float) -> np.ndarray:
-    return with_past(np.clip(mean, low, high) - mean)
-
-
 def _flat_limits(
-    r: Residuals, knot: tuple[float, float], finer: bool
+    r: Residuals, knot: tuple[float, float], finer: bool, settings: LoopSettings
 ) -> tuple[float, float, float]:
     """Output at the knots, and the slope beyond them as a share of that between them.
 
@@ -126,10 +96,11 @@ def _flat_limits(
     low, high = knot
     if finer:
         grid = np.quantile(m, np.linspace(0.02, 0.98, 25))
-        low, high = located_limits(r, lambda a, b: np.clip(m, a, b) - m, knot, grid, m[:, None])
-    there = r.held_out & np.isfinite(r.output)
+        search = Search(r, m[:, None], settings)
+        low, high = search.located_limits(lambda a, b: np.clip(m, a, b) - m, knot, grid)
+    rows = r.held_out & np.isfinite(r.output)
     columns = np.column_stack([np.ones(len(r)), m, np.clip(m, low, high) - m])
-    a, b, c = np.linalg.lstsq(columns[there], r.output[there], rcond=1e-8)[0]
+    a, b, c = solve(columns[rows], r.output[rows])
     return float(a + b * low), float(a + b * high), float((b - c) / b) if b else 1.0
 
 
@@ -156,46 +127,40 @@ class Ties:
 
 
 def ties_at_the_top(
-    output: np.ndarray, mean: np.ndarray, *, replicates: int = 200, seed: int = 0
+    output: np.ndarray, mean: np.ndarray, settings: LoopSettings, *, seed: int = 0
 ) -> Ties:
     """Test whether more samples are at the largest value than the model has there.
 
-    Under the null the record is mean plus residual (its innovations in random order through the
-    autoregressive filter), rounded to the record's own resolution: a slow record of few digits
-    has ties at each of its peaks without any limit.
+    Under the null the record is mean plus residual (`Noise`), rounded to the record's own
+    resolution: a slow record of few digits has ties at each of its peaks without any limit.
 
     Args:
         output: (n,) measured, NaN where missing [output]. mean: (n,) [output].
-        replicates: of the null. seed: of their random order.
-
-    Raises:
-        ValueError: where fewer than 30 samples are measured.
+        settings: thresholds. seed: of the replicates.
     """
-    there = np.isfinite(output) & np.isfinite(mean)
-    y = output[there]
+    measured = np.isfinite(output) & np.isfinite(mean)
+    y = output[measured]
     top, spread = float(y.max(initial=-np.inf)), float(np.ptp(y)) if len(y) else 0.0
     count = int((y >= top - SAME * spread).sum())
-    over = np.maximum(mean[there] - top, 0.0)
+    over = np.maximum(mean[measured] - top, 0.0)
     size = float(np.sqrt(np.mean(over**2)))
     if count < 3 or spread == 0:
         return Ties(top, count, 1.0, size)
-    residual = np.where(there, output - mean, np.nan)
-    whiten = fitted_filter(residual)
-    q = _resolution(y, spread)
-    e = whiten(residual)
-    e = e[np.isfinite(e)]
-    generator = np.random.default_rng(seed)
-    drawn = generator.choice(e, size=(replicates, there.size + 50))
-    noise = lfilter([1.0], np.concatenate([[1.0], -whiten.coefficients]), drawn, axis=1)[:, 50:]
-    made = (mean + noise)[:, there]
-    if q > 0:
-        made = np.round((made - top) / q)
-    null = (made >= made.max(1, keepdims=True)).sum(1).astype(float)
+    residual = np.where(measured, output - mean, np.nan)
+    whiten, level = fitted_filter(residual, settings), residual[measured].mean()
+    none = np.zeros((0, len(mean)))
+    noise = noise_of(whiten.coefficients, whiten(residual), whiten.order + 1, ~measured, none)
+    q, counts = _resolution(y, spread), []
+    for series in noise.replicates(settings.replicates, seed):
+        made = (mean + level + series)[:, measured]
+        made = np.round((made - top) / q) if q > 0 else made
+        counts.append((made >= made.max(1, keepdims=True)).sum(1))
+    null = np.concatenate(counts).astype(float)
     # Most records have one sample at their maximum: a distribution of counts has a tail, too.
-    p = max(tail_probability(null, count), float(stats.poisson.sf(count - 2, max(null.mean(), 1))))
-    if null.std() == 0:
-        p = float(stats.poisson.sf(count - 2, 1.0))
-    return Ties(top, count, min(1.0, p), size)
+    p = float(stats.poisson.sf(count - 2, max(null.mean(), 1.0)))
+    if null.std() > 0:
+        p = max(p, tail_probability(null, count, settings))
+    return Ties(top, count, p, size)
 
 
 def _resolution(y: np.ndarray, spread: float) -> float:
@@ -241,9 +206,9 @@ class Saturation(Effect):
         Posterior mean and standard deviation of the function [output] where it is best known of
         where it is at its limit to within a standard deviation; of the limits in the evidence.
         """
-        if not isinstance(fit.model.layers[-1], Static):
+        if not isinstance(fit.model.output_wire.layer, Static):
             return {}
-        band = fit.static_function(fit.model.wires[-1].name, record)
+        band = fit.static_function(fit.model.output_wire.name, record)
         seen = (band.x >= band.inputs.min()) & (band.x <= band.inputs.max())
         mean, sd = band.mean[seen, 0], band.sd[seen, 0]
         scale, offset = fit.scaling.output_scale[0], fit.scaling.output_offset[0]

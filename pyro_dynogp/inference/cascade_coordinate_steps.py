@@ -13,8 +13,8 @@ from pyro_dynogp.layers.functions import StaticFunction
 
 # Unconstrained values of sites (*s, *unconstrained) by name.
 Parts = dict[str, Tensor]
-# A static function, and points (*s, M, d), given such values.
-Layer = Callable[[Parts], tuple[StaticFunction, Tensor]]
+# What values v of a site act through, h = mu + W v: mu (*s, m) and W (*s, m, m), given such values.
+Affine = Callable[[Parts], tuple[Tensor, Tensor]]
 
 
 class Step(Protocol):
@@ -104,26 +104,27 @@ class RelativeToGain:
 
 @dataclass(frozen=True, eq=False)
 class GivenOthers:
-    """Inducing values relative to what the data and all other parameters say of them.
+    """Values of a standard normal prior relative to what the data and all other parameters say.
 
-    About the start the log-likelihood is quadratic in the function's mean values h = mu + W v at
-    fixed points, b'h - h'Lambda h / 2. With the prior of v given the other parameters that is a
-    normal distribution of v, whose standardised values are the coordinates.
+    About the start the log-likelihood is quadratic in what the values v act through,
+    h = mu + W v (a function's mean at fixed points; gains, v in units of their scale):
+    b'h - h'Lambda h / 2. With the prior of v given the other parameters that is a normal
+    distribution of v, whose standardised values are the coordinates.
 
     Attributes:
-        name: site of the whitened inducing values (*s, e, M). layer: the static function, and the
-            points, given the unconstrained values of all sites. precision: Lambda (eM, eM).
-            linear: b (eM,).
+        name: site of v (*s, *shape), m values. affine: mu and W given the unconstrained values of
+            all sites. precision: Lambda (m, m). linear: b (m,). rank: dimensions of the shape.
     """
 
     name: str
-    layer: Layer
+    affine: Affine
     precision: Tensor
     linear: Tensor
+    rank: int = 2
 
     def _normal(self, z: Parts) -> tuple[Tensor, Tensor]:
-        """Mean (*s, eM) of v, and the Cholesky factor R (*s, eM, eM) of its precision."""
-        mean, W = affine(*self.layer(z))
+        """Mean (*s, m) of v, and the Cholesky factor R (*s, m, m) of its precision."""
+        mean, W = self.affine(z)
         one = torch.eye(W.shape[-1], dtype=W.dtype)
         R = torch.linalg.cholesky(one + W.mT @ self.precision @ W)
         push = W.mT @ (self.linear - mean @ self.precision).unsqueeze(-1)
@@ -133,7 +134,8 @@ class GivenOthers:
         """As `Step` has it."""
         centre, R = self._normal(x)
         value = x[self.name]
-        apart = torch.linalg.solve_triangular(R.mT, value.flatten(-2).unsqueeze(-1), upper=True)
+        flat = value.flatten(-self.rank).unsqueeze(-1)
+        apart = torch.linalg.solve_triangular(R.mT, flat, upper=True)
         x[self.name] = (centre + apart.squeeze(-1)).reshape(value.shape)
         log_det: Tensor = -R.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         return log_det
@@ -142,7 +144,7 @@ class GivenOthers:
         """As `Step` has it."""
         centre, R = self._normal(z)
         value = z[self.name]
-        apart = (value.flatten(-2) - centre).unsqueeze(-1)
+        apart = (value.flatten(-self.rank) - centre).unsqueeze(-1)
         z[self.name] = (R.mT @ apart).squeeze(-1).reshape(value.shape)
 
 

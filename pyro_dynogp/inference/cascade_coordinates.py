@@ -1,6 +1,6 @@
-r"""Coordinates in which the posterior of a cascade has no bent ridges, for the no-U-turn sampler.
+r"""Coordinates in which a posterior has no bent ridges, for samplers and for normals around a mode.
 
-Two kinds of parameters make up for each other along curves that no mass matrix straightens:
+Some parameters make up for each other along curves that no mass matrix straightens:
 
 - the size of a signal g = G u + ... and everything in a static function f(g) that is measured in
   units of it (lengthscale, grid of inducing locations), with the process noise. Here the largest
@@ -11,6 +11,9 @@ Two kinds of parameters make up for each other along curves that no mass matrix 
   rules. The coordinates are standardised values of v given the other parameters, by a likelihood
   that is quadratic in the function's values. (Of these and v each would serve one of the two;
   Papaspiliopoulos, Roberts & Skold 2007.)
+- in models without static functions the scale of a pair's noise gains and the gains in units of it:
+  the data know their product, or nothing where the pair has no noise. The same standardised values
+  serve there.
 
 The sign of G_r stays that of the start: with gains of the other sign, and all functions of g turned
 about zero, prior and likelihood are the same, so that nothing is lost but a mirror image.
@@ -19,21 +22,22 @@ about zero, prior and likelihood are the same, so that nothing is lost but a mir
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from copy import copy
 
 import torch
 from torch import Tensor
 
 from pyro_dynogp.inference.cascade_coordinate_steps import (
+    Affine,
     GivenOthers,
-    Layer,
     Parts,
     RelativeToGain,
     Step,
     affine,
 )
-from pyro_dynogp.inference.density import Potential, Site, parts
+from pyro_dynogp.inference.density import Potential, Site, parts, within_edges
 from pyro_dynogp.layers.functions import StaticFunction
+from pyro_dynogp.layers.sites import Arguments, Program
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.wiring import Dynamic, Static, Wire
 
@@ -42,21 +46,30 @@ LEAST = 0.1
 
 
 class StraightPotential(Potential):
-    """A cascade's `Potential` in the coordinates of this module; trajectories integrated out."""
+    """A model's `Potential` in the coordinates of this module; trajectories integrated out."""
 
     nearly_normal = True
 
-    def __init__(self, model: Model, args: tuple[Any, ...], values: Mapping[str, Tensor]) -> None:
+    def __init__(self, model: Model, args: Arguments, values: Mapping[str, Tensor]) -> None:
         super().__init__(model, args, values)
         self.steps = steps_of(model, Potential(model, args, values))
 
+    def on(self, args: Arguments) -> StraightPotential:
+        """The density of other data in the same coordinates."""
+        other = copy(self)
+        Potential.__init__(other, self.model, args, self.at)
+        return other
+
     def pack(self, values: Mapping[str, Tensor]) -> Tensor:
-        """Constrained values of every site to coordinates (d,)."""
-        z = by_name(self.sites, super().pack(values))
+        """Constrained values (*s, *shape) of every site to coordinates (*s, d)."""
+        first = self.sites[0]
+        lead = values[first.name].shape[: values[first.name].dim() - len(first.shape)]
+        inverse = [site.transform.inv(values[site.name]).reshape(*lead, -1) for site in self.sites]
+        z = by_name(self.sites, within_edges(torch.cat(inverse, -1)))
         with torch.no_grad():
             for step in reversed(self.steps):
                 step.backward(z)
-        return torch.cat([z[site.name].reshape(-1) for site in self.sites])
+        return torch.cat([z[site.name].reshape(*lead, -1) for site in self.sites], -1)
 
     def unpack(self, x: Tensor) -> dict[str, Tensor]:
         """Coordinates (*s, d) to constrained values (*s, *shape) of every site."""
@@ -86,7 +99,7 @@ def by_name(sites: Sequence[Site], z: Tensor) -> Parts:
 
 
 def potential_for_sampling(
-    model: Any, args: tuple[Any, ...], values: Mapping[str, Tensor]
+    model: Program, args: Arguments, values: Mapping[str, Tensor]
 ) -> Potential:
     """The potential of a model in the coordinates that chains are best run in."""
     if isinstance(model, Model) and model.has_function and model.integrate == "all":
@@ -95,8 +108,15 @@ def potential_for_sampling(
 
 
 def steps_of(model: Model, plain: Potential) -> list[Step]:
-    """The changes of coordinates that a cascade's layers ask for, in the order of `forward`."""
+    """The changes of coordinates that a model's layers ask for, in the order of `forward`."""
     named = {site.name: site for site in plain.sites}
+    if not model.has_function:
+        units = {wire.name: f"{wire.name}_noise_gain_unit" for wire in model.wires}
+        return [
+            given_others(unit, plain, _noise_gains(name), rank=3)
+            for name, unit in units.items()
+            if unit in named and not _is_exponential(named[unit])
+        ]
     sizes: dict[str, RelativeToGain] = {}
     for one in model.wires:
         if isinstance(one.layer, Dynamic) and f"{one.name}_input_gain" in named:
@@ -153,8 +173,8 @@ def _is_exponential(site: Site) -> bool:
 
 def _layer(
     model: Model, one: Wire, layer: Static, plain: Potential, relative: RelativeToGain | None
-) -> Layer:
-    """A static function as the unconstrained values of all sites have it, and where it is seen.
+) -> Affine:
+    """Mean values of a static function by its inducing values.
 
     The points are the inducing locations at the start, in units of the signal's size.
     """
@@ -169,14 +189,27 @@ def _layer(
     if relative is not None:
         fixed = fixed / relative.size(start)
 
-    def at(z: Parts) -> tuple[StaticFunction, Tensor]:
-        return function(z), fixed if relative is None else fixed * relative.size(z)[..., None, None]
+    def at(z: Parts) -> tuple[Tensor, Tensor]:
+        points = fixed if relative is None else fixed * relative.size(z)[..., None, None]
+        return affine(function(z), points)
 
     return at
 
 
-def given_others(name: str, plain: Potential, layer: Layer) -> Step:
-    """The coordinates of one static layer from derivatives of the density at the start."""
+def _noise_gains(name: str) -> Affine:
+    """Noise gains of a dynamic layer, up to a factor, by those in units of their pair's scale."""
+
+    def at(z: Parts) -> tuple[Tensor, Tensor]:
+        scale = z[f"{name}_noise_gain_local_scale"].exp()  # (*s, P)
+        unit = z[f"{name}_noise_gain_unit"]
+        each = scale[..., None, None].expand_as(unit).flatten(-3)
+        return torch.zeros_like(each), torch.diag_embed(each)
+
+    return at
+
+
+def given_others(name: str, plain: Potential, layer: Affine, rank: int = 2) -> Step:
+    """The coordinates of one site, see `GivenOthers`, from derivatives at the start."""
     z = plain.pack(plain.at)
     own = by_name(plain.sites, torch.arange(plain.size))[name].flatten().tolist()
     hessian = plain.hessian_of(z.numpy(), own)
@@ -189,7 +222,7 @@ def given_others(name: str, plain: Potential, layer: Layer) -> Step:
     linear = v - torch.tensor(gradient) + by_v @ v
     linear = vectors @ (torch.where(known > 0.0, 1.0, 0.0) * (vectors.mT @ linear))
     with torch.no_grad():
-        mean, W = affine(*layer(by_name(plain.sites, z)))
+        mean, W = layer(by_name(plain.sites, z))
         back = torch.linalg.inv(W)
     precision = back.mT @ by_v @ back
-    return GivenOthers(name, layer, precision, back.mT @ linear + precision @ mean)
+    return GivenOthers(name, layer, precision, back.mT @ linear + precision @ mean, rank)

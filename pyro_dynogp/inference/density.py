@@ -6,7 +6,6 @@ import contextlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pyro
@@ -15,9 +14,10 @@ from torch import Tensor
 from torch.distributions import biject_to
 from torch.distributions.transforms import Transform
 
-from pyro_dynogp.inference.optimise.descent import bounded_root, descend, hessian
+from pyro_dynogp.inference.log_joint import LogJoint, density_of
+from pyro_dynogp.inference.optimise.descent import WIDEST, bounded_root, descend, hessian
+from pyro_dynogp.layers.sites import Arguments, Program
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
-from pyro_dynogp.support.errors import invalid
 
 # Energy where there is no density.
 WALL = 1e15
@@ -47,32 +47,17 @@ def parts(sites: Sequence[Site], z: Tensor) -> Iterator[tuple[Site, Tensor]]:
         start = stop
 
 
-def log_prob_by_draw(trace: Any, count: int) -> Tensor:
-    """Log-density (S,) of all sites of a trace, run at S draws at once and scored.
-
-    A site that no draw changes has one density for all of them.
-    """
-    total = torch.zeros(count, dtype=torch.float64)
-    for node in trace.nodes.values():
-        if node["type"] != "sample" or type(node["fn"]).__name__ == "_Subsample":
-            continue
-        log_prob = node["log_prob"]
-        several = log_prob.dim() > 0 and log_prob.shape[0] == count
-        total = total + (log_prob.reshape(count, -1).sum(1) if several else log_prob.sum())
-    return total
-
-
 def joint_energy(
-    model: Callable[..., Any],
-    args: tuple[Any, ...],
+    log_joint: LogJoint,
     sites: Sequence[Site],
     z: Tensor,
     *,
     jacobian: bool,
+    inputs: Sequence[Tensor] | None = None,
 ) -> Tensor:
     """-log p(y, values) at the unconstrained vector z (d,), or (k,) at vectors z (k, d) together.
 
-    With `jacobian` the density is that of the unconstrained vector.
+    With `jacobian` the density is that of the unconstrained vector. `inputs` as of `LogJoint`.
     """
     values: dict[str, Tensor] = {}
     log_jacobian = torch.zeros(z.shape[:-1], dtype=torch.float64)
@@ -82,17 +67,7 @@ def joint_energy(
         if jacobian:
             each = site.transform.log_abs_det_jacobian(part, value)
             log_jacobian = log_jacobian + each.reshape(*z.shape[:-1], -1).sum(-1)
-    trace = _scored(model, args, values)
-    log_joint = trace.log_prob_sum() if z.dim() == 1 else log_prob_by_draw(trace, len(z))
-    return -log_joint - log_jacobian
-
-
-def _scored(model: Callable[..., Any], args: tuple[Any, ...], values: Mapping[str, Tensor]) -> Any:
-    """Trace of a model at given values, with the log-density of every site."""
-    conditioned = pyro.poutine.condition(model, data=dict(values))
-    trace = pyro.poutine.trace(conditioned).get_trace(*args)
-    trace.compute_log_prob()
-    return trace
+    return -log_joint(values, None if z.dim() == 1 else len(z), inputs) - log_jacobian
 
 
 def each_with_gradient(
@@ -152,31 +127,15 @@ class Potential:
 
     nearly_normal = False
 
-    def __init__(
-        self, model: Callable[..., Any], args: tuple[Any, ...], values: Mapping[str, Tensor]
-    ) -> None:
+    def __init__(self, model: Program, args: Arguments, values: Mapping[str, Tensor]) -> None:
         self.model, self.args, self.at = model, args, dict(values)
-        trace = pyro.poutine.trace(pyro.poutine.condition(model, data=dict(values))).get_trace(
-            *args
-        )
-        unset = [
-            name
-            for name, node in trace.nodes.items()
-            if node["type"] == "sample" and not node["is_observed"]
-        ]
-        if unset:
-            raise invalid(
-                "values", expected=f"a value for every latent site, {unset} too", got="none"
-            )
+        self.log_density = density_of(model, args)
         self.sites: list[Site] = []
-        for name, node in trace.nodes.items():
-            if node["type"] == "sample" and name in values:
-                value = node["value"].detach()
-                transform = biject_to(node["fn"].support)
-                self.sites.append(Site(name, value.shape, transform.inv(value).shape, transform))
-        observed = [node["value"] for node in trace.nodes.values()
-                    if node["type"] == "sample" and node["is_observed"]]  # fmt: skip
-        count = sum(y.numel() for y in observed if torch.is_tensor(y))
+        latent, count = self.log_density.latent(values)
+        for name, prior, value in latent:
+            transform = biject_to(prior.support)
+            unconstrained = transform.inv(value).shape
+            self.sites.append(Site(name, value.shape, unconstrained, transform))
         # Points that are evaluated at once.
         batches = getattr(model, "takes_batches", False)
         self.width = max(1, AT_ONCE // max(count, 1)) if batches else 1
@@ -197,7 +156,7 @@ class Potential:
         A mode may lie on a boundary to the last digit, where the vector would be infinite.
         """
         parts = [site.transform.inv(values[site.name]).reshape(-1) for site in self.sites]
-        return torch.cat(parts).detach().nan_to_num(nan=math.nan, posinf=EDGE, neginf=-EDGE)
+        return within_edges(torch.cat(parts))
 
     def unpack(self, z: Tensor) -> dict[str, Tensor]:
         """Unconstrained vectors (*s, d) to constrained values (*s, *shape) of every site."""
@@ -205,7 +164,7 @@ class Potential:
 
     def log_joint(self, values: Mapping[str, Tensor]) -> Tensor:
         """Log p(y, values), of constrained values."""
-        return _scored(self.model, self.args, values).log_prob_sum()
+        return self.log_density(values, None)
 
     def energy(
         self, z: Tensor, *, jacobian: bool, inputs: Sequence[Tensor] | None = None
@@ -215,8 +174,7 @@ class Potential:
         Of the values, or with `jacobian` of the unconstrained vector. With `inputs`, for each
         record (k, n, n_u) or (n, n_u), each point has inputs of its own.
         """
-        args = self.args if inputs is None else (*self.args, inputs)
-        return joint_energy(self.model, args, self.sites, z, jacobian=jacobian)
+        return joint_energy(self.log_density, self.sites, z, jacobian=jacobian, inputs=inputs)
 
     def value_and_gradient(
         self, z: np.ndarray, *, jacobian: bool = False
@@ -263,21 +221,19 @@ class Potential:
         """Energies (k,) and gradients (k, d) of the unconstrained vector's density."""
         return self.values_and_gradients(z, jacobian=True)
 
-    def log_evidence(self, values: Mapping[str, Tensor], *, widest: float) -> float:
+    def log_evidence(self, values: Mapping[str, Tensor]) -> float:
         """Laplace's approximation of log p(y) from the neighbourhood of `values` alone [nats].
 
         A Gaussian integral of the unconstrained vector's density with the curvature there: by it
         optima of one model are compared, of which a high one may be a needle. Directions that are
-        flatter than a standard deviation of `widest` count as that wide (Tierney & Kadane 1986).
+        flatter than a standard deviation of `WIDEST` count as that wide (Tierney & Kadane 1986).
         """
         z = self.pack(values).numpy()
         energy = self.value_and_gradient(z, jacobian=True)[0]
-        curvature = np.maximum(np.linalg.eigvalsh(self.hessian(z, step=1e-3)), widest**-2)
+        curvature = np.maximum(np.linalg.eigvalsh(self.hessian(z, step=1e-3)), WIDEST**-2)
         return float(-energy - 0.5 * np.log(curvature / (2.0 * math.pi)).sum())
 
-    def laplace(
-        self, values: Mapping[str, Tensor], *, widest: float
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def laplace(self, values: Mapping[str, Tensor]) -> tuple[np.ndarray, np.ndarray]:
         """Centre (d,) and root (d, d) of the Laplace approximation of the unconstrained vector.
 
         The centre is the mode of that vector's own density (with Jacobian), climbed to from
@@ -287,8 +243,13 @@ class Potential:
         z, _, _ = descend(
             self.with_jacobian, self.pack(values).numpy(), LAPLACE_STEPS, every=every, first=0
         )
-        return z, bounded_root(self.hessian(z), widest=widest)
+        return z, bounded_root(self.hessian(z))
 
 
 # Unconstrained value of what lies on a boundary: within 1e-13 of it.
 EDGE = 30.0
+
+
+def within_edges(z: Tensor) -> Tensor:
+    """Unconstrained vectors, finite where values lie on a boundary."""
+    return z.detach().nan_to_num(nan=math.nan, posinf=EDGE, neginf=-EDGE)

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from pyro_dynogp.data.record import Record
-from pyro_dynogp.data.records import as_records
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.optimise.maximum import Optimum
 from pyro_dynogp.inference.starts.poles import grown
 from pyro_dynogp.lti.arithmetic import SEGMENT
-from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.models.assembly import assemble
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.system import scaled_inputs, scaled_outputs
+from pyro_dynogp.models.prepared import Records
 from pyro_dynogp.moments import filtering
 from pyro_dynogp.moments.stepping import step_through
 
@@ -29,27 +26,24 @@ BLOCKS, LEAST = 8, 2
 SILENT, WORTH = 1e-3, 0.01
 
 
-def free_run_error(model: Model, values: Mapping[str, Tensor], records: Sequence[Record]) -> float:
+def free_run_error(model: Model, values: Mapping[str, Tensor], records: Records) -> float:
     """Root mean square error of runs through blocks of records, in scaled outputs.
 
     Each block begins at the mean of the filter's state; functions are at their mean and there is no
     process noise from there on. Infinite where a run diverges.
 
     Args:
-        model: with its scaling, trajectories integrated out. values: of all its sites.
-        records: prepared, that the values are of.
+        model: trajectories integrated out. values: of all its sites. records: that they are of.
     """
-    assert model.scaling is not None
+    prepared = model.prepare(records)
     squares, count = 0.0, 0
     with torch.no_grad():
-        system = model.system(values, model.scaling)
-        for index, record in enumerate(records):
-            suffix = "" if len(records) == 1 else f"_{index}"
+        system = model.system(values, prepared[0].scaling)
+        for index, record in enumerate(prepared):
+            suffix = "" if len(prepared) == 1 else f"_{index}"
             here = model.begin(system, model.states_of(values, suffix))
-            inputs = scaled_inputs(model.scaling, record)
-            problem = assemble(here, time_grid(record.time), inputs).with_outputs(
-                scaled_outputs(model.scaling, record)
-            )
+            assembly = assemble(here, record.grid, record.scaled_inputs)
+            problem = assembly.with_outputs(record.scaled_outputs)
             (numbers,), _ = problem.elements()
             means = filtering.run(problem.layout, numbers)[1]
             length = SEGMENT * max(LEAST, -(-len(means) // BLOCKS))
@@ -73,7 +67,7 @@ def free_run_error(model: Model, values: Mapping[str, Tensor], records: Sequence
 
 def silenced(
     model: Model,
-    records: Record | Sequence[Record],
+    records: Records,
     optimum: Optimum,
     start: Mapping[str, Tensor],
 ) -> Optimum:
@@ -91,10 +85,7 @@ def silenced(
     return replace(optimum, energy=float(energy), values=values)
 
 
-def noise_pays(
-    model: Model, records: Record | Sequence[Record], noisy: Optimum, quiet: Optimum
-) -> bool:
+def noise_pays(model: Model, records: Records, noisy: Optimum, quiet: Optimum) -> bool:
     """Whether free runs over blocks are better by a hundredth with process noise than without."""
-    several = as_records(records)
-    with_noise, without = (free_run_error(model, one.values, several) for one in (noisy, quiet))
+    with_noise, without = (free_run_error(model, one.values, records) for one in (noisy, quiet))
     return with_noise < (1.0 - WORTH) * without

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Literal
 
 import pyro
 import pyro.distributions as dist
@@ -105,7 +105,7 @@ class Mixture:
     def _numbered(self) -> bool:
         return len(self.weights) > 1 or bool(self.points and self.sites)
 
-    def __call__(self, *args: Any) -> dict[str, Tensor]:
+    def __call__(self, *args: object) -> dict[str, Tensor]:
         """Sample the component, then every site."""
         k = torch.zeros((), dtype=torch.int64)
         if self._numbered:
@@ -219,7 +219,7 @@ class Sampled:
         """In words."""
         return "SVI with trajectories as sites" if self.log_q_sites else self.method.upper()
 
-    def __call__(self, *args: Any) -> dict[str, Tensor]:
+    def __call__(self, *args: object) -> dict[str, Tensor]:
         """Sample the number of a draw, then every site at it."""
         count = next(iter(self.values.values())).shape[0]
         equal = torch.full((count,), 1.0 / count, dtype=torch.float64)
@@ -250,7 +250,7 @@ class Sampled:
 Posterior = Mixture | Sampled
 
 
-def draws_of_guide(guide: Guide, count: int, *args: Any) -> dict[str, Tensor]:
+def draws_of_guide(guide: Guide, count: int, *args: object) -> dict[str, Tensor]:
     """Draws (count, *shape) of every site that is not auxiliary."""
     with torch.no_grad(), pyro.plate("draws", count, dim=-1):
         trace = pyro.poutine.trace(guide).get_trace(*args)

@@ -12,22 +12,19 @@ from torch import Tensor
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.methods.base import Problem
-from pyro_dynogp.inference.methods.mode import suited_optimizer
+from pyro_dynogp.inference.methods.mode import optimizer_for
 from pyro_dynogp.inference.methods.nuts import sample_posterior
-from pyro_dynogp.inference.methods.optima import (
-    POLISH,
-    Hyperparameters,
-    free_sites,
-    posterior_of,
-)
+from pyro_dynogp.inference.methods.optima import POLISH, Hyperparameters, posterior_of
+from pyro_dynogp.inference.methods.svi import Schedule
 from pyro_dynogp.inference.optimise.maximum import Effort, Optimum, maximise
 from pyro_dynogp.inference.posteriors import Mixture, Sampled, draws_of_guide
 from pyro_dynogp.inference.run import Run
+from pyro_dynogp.models.prepared import as_measured
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import seeded
 
-# Iterations from the old optimum: of L-BFGS, of Adam, of SVI for all sites.
+# Most iterations from the old optimum: of linear models, of Adam, of SVI for all sites.
 LINEAR_STEPS, CASCADE_STEPS, SVI_STEPS = 300, 200, 400
 # Adam's first step: the old optimum is close by.
 REFIT_RATE = 0.004
@@ -58,43 +55,34 @@ def refit(fit: FittedKind, records: Record | Sequence[Record]) -> FittedKind:
         )
     if len(several) != len(fit.records):
         raise invalid("records", expected=f"{len(fit.records)}, as before", got=str(len(several)))
-    target: Any = fit.model.collapsed
-    argument = several[0] if len(several) == 1 else several
-    cascade = fit.model.has_function
+    problem = Problem(fit.model, fit.model.prepare(several))
+    run = Run(fit.seed, workers=1)
+    cascade, optimizer = fit.model.has_function, optimizer_for(fit.model)
     optima = maximise(
-        target,
-        argument,
+        problem.target,
+        problem.records,
         optima_of(fit),
-        optimizer=suited_optimizer(fit.model),
+        run,
+        optimizer=optimizer,
         steps=CASCADE_STEPS if cascade else LINEAR_STEPS,
-        seed=fit.seed,
-        workers=1,
         effort=Effort(kept=1.0, rate=REFIT_RATE),
     )
     best = optima[0]
     changed: dict[str, Any] = {
         "mode": FrozenMapping(best.values),
         "history": best.history,
-        "records": several,
+        "records": as_measured(problem.records),
     }
     if fit.method == "map":
         draws = {name: value.unsqueeze(0) for name, value in best.values.items()}
         changed |= {"posterior": Mixture.at(best.values), "draws": FrozenMapping(draws)}
         return replace(fit, **changed)
     if fit.method == "nuts":
-        sampled = FrozenMapping(_sampled(fit, target, argument, best))
+        sampled = FrozenMapping(_sampled(fit, problem, best, run))
         return replace(fit, posterior=Sampled(sampled), draws=sampled, **changed)
     family = family_of(fit)
-    run = Run(fit.seed, workers=1)
-    found = posterior_of(
-        target,
-        argument,
-        optima,
-        family,
-        free=free_sites(Problem(fit.model, several)),
-        steps=POLISH if family == "map" else SVI_STEPS,
-        run=run,
-    )
+    schedule = Schedule(POLISH if family == "map" else SVI_STEPS)
+    found = posterior_of(problem, optima, family, run, schedule)
     changed |= {"mode": FrozenMapping(found.mode), "history": found.elbo}
     count = len(next(iter(fit.draws.values())))
     with seeded(fit.seed):
@@ -121,17 +109,15 @@ def family_of(fit: Fitted) -> Hyperparameters:
     return "normal" if independent else "multivariate normal"
 
 
-def _sampled(fit: Fitted, target: Any, argument: Any, best: Optimum) -> dict[str, Tensor]:
+def _sampled(fit: Fitted, problem: Problem, best: Optimum, run: Run) -> dict[str, Tensor]:
     chains = int(fit.diagnostics["chains"])
     found = sample_posterior(
-        target,
-        argument,
+        problem.target,
+        problem.records,
         best.values,
+        run,
         chains=chains,
         draws=len(next(iter(fit.draws.values()))) // chains,
         warmup=WARMUP,
-        seed=fit.seed,
-        workers=1,
-        progress=False,
     )
     return {name: value.flatten(0, 1) for name, value in found.draws.items()}

@@ -1,4 +1,4 @@
-"""What a run needs besides model, record and method."""
+"""How a fit is run: one object, made where the run begins and handed down."""
 
 from __future__ import annotations
 

@@ -10,19 +10,20 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyro
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
+from torch.distributions import biject_to
 
 from pyro_dynogp.data.channels import from_plain, to_plain
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.scaling import Scaling
-from pyro_dynogp.inference.density import Potential, Site
+from pyro_dynogp.inference.density import Site
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.posteriors import Mixture, Posterior, Sampled
 from pyro_dynogp.layers.noise import Likelihood
+from pyro_dynogp.layers.sites import Values
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.wiring import Dynamic, Layer, Static
 from pyro_dynogp.support.errors import invalid
@@ -245,20 +246,13 @@ def _record(labels: Mapping[str, Any], tensors: Mapping[str, Tensor], key: str) 
 
 
 def _sites(
-    model: Model,
-    scaling: Scaling,
-    mode: Mapping[str, Tensor],
-    points: Mapping[str, Tensor],
-    records: int,
+    model: Model, scaling: Scaling, mode: Values, points: Values, records: int
 ) -> tuple[Site, ...]:
     """The sites of the normal posterior in their order, without the training records."""
-
-    def parameters() -> None:
-        model.collapsed.sample_system(scaling)
-        for index in range(records):
-            model.sample_states("" if records == 1 else f"_{index}")
-
-    free = {name: value for name, value in mode.items() if name not in points}
-    at = {name: mode[name] for name in points}
-    conditioned = pyro.poutine.condition(parameters, data=at)
-    return tuple(Potential(conditioned, (), free).sites)
+    found = []
+    for site in model.collapsed.all_sites(scaling, records):
+        if site.name not in points:
+            transform = biject_to(site.prior.support)
+            unconstrained = transform.inv(mode[site.name]).shape
+            found.append(Site(site.name, site.shape, unconstrained, transform))
+    return tuple(found)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 
 from pyro_dynogp.inference.fitted import Fitted
-from pyro_dynogp.models.wiring import Dynamic
+from pyro_dynogp.lti.modes import Modes
+from pyro_dynogp.models.wiring import Dynamic, Layer
 
 
 def summary(fit: Fitted) -> str:
@@ -31,14 +30,14 @@ def summary(fit: Fitted) -> str:
     return "\n".join(lines)
 
 
-def _describe(layer: Any) -> str:
+def _describe(layer: Layer) -> str:
     width = f", {layer.outputs} outputs" if layer.outputs > 1 else ""
     if isinstance(layer, Dynamic):
         return f"dynamic, {layer.pairs} pairs{width}"
     return f"static, {layer.inducing} inducing values{width}"
 
 
-def _modes(modes: Any, unit: str) -> list[str]:
+def _modes(modes: Modes, unit: str) -> list[str]:
     frequency, damping = modes.natural_frequency, modes.damping
     return [
         f"  natural frequency {float(frequency[j]):10.4g} rad/{unit}"

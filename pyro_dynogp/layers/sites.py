@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,6 +15,9 @@ from torch import Tensor
 # treats as unknown; "hyperparameter": all other sites.
 Role = Literal["hyperparameter", "free"]
 Values = Mapping[str, Tensor]
+# A model or a guide, the library's or a user's, and what it is called with.
+Program = Callable[..., object]
+Arguments = tuple[object, ...]
 
 
 @dataclass(frozen=True, eq=False)

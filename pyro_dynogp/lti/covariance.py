@@ -92,6 +92,26 @@ def stationary_variance(modes: Modes) -> Tensor:
     return 2.0 * (modes.C * state_output_covariance(modes)).sum(-1).real
 
 
+def observability(modes: Modes, time: Tensor) -> Tensor:
+    """Rows (*b, N, 2P) that read the outputs from the state [Re x; Im x] at time[0]."""
+    decay = torch.exp(modes.poles.unsqueeze(-2) * (time - time[0]).unsqueeze(-1))
+    row = modes.C.unsqueeze(-3) * decay.unsqueeze(-2)  # *b, n, n_y, P
+    real = torch.cat([2.0 * row.real, -2.0 * row.imag], dim=-1)
+    return real.flatten(-3, -2)
+
+
+def jitter_variance(modes: Modes, initial_covariance: Tensor | None, relative: float) -> Tensor:
+    """Variance (*b, 1) that is added to a noise-free trajectory so that it can be factored."""
+    variance = stationary_variance(modes).amax(-1)
+    if initial_covariance is not None:
+        h = output_row(modes)
+        variance = variance + torch.einsum(
+            "...ai,...ij,...aj->...a", h, initial_covariance, h
+        ).amax(-1)
+    tiny = torch.finfo(torch.float64).tiny ** 0.5
+    return (relative * variance + tiny).unsqueeze(-1)
+
+
 def autocovariance(modes: Modes, lag: Tensor) -> Tensor:
     """Covariance of the outputs as a function of lag.
 

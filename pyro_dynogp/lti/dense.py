@@ -11,10 +11,9 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from pyro_dynogp.lti.covariance import autocovariance, state_covariance
+from pyro_dynogp.lti.covariance import autocovariance, observability, state_covariance
 from pyro_dynogp.lti.grid import TimeGrid, time_grid
 from pyro_dynogp.lti.modes import Modes
-from pyro_dynogp.lti.semiseparable import observability
 from pyro_dynogp.support.tensors import Numbers
 
 

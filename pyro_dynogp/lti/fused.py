@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pyro_dynogp.lti.covariance import output_row
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.primitives import array, flatten_batch, run
 
@@ -39,8 +40,8 @@ def _covariances(
     return (*sums, *products, hermitian, symmetric, q)
 
 
-class _OutputRows(torch.autograd.Function):
-    """Rows h, g and variances k0 of the covariance recursion from poles, C and L."""
+class _OutputCovariance(torch.autograd.Function):
+    """q = E[xi y] (b, n_y, P) from poles, C and L."""
 
     @staticmethod
     def forward(ctx: Any, shared: bool, *args: Tensor) -> Any:  # poles (b, P), C, L
@@ -49,23 +50,18 @@ class _OutputRows(torch.autograd.Function):
             q = _covariances(shared, lam, C, L)[-1]
         ctx.save_for_backward(*args)
         ctx.shared = shared
-        h = np.concatenate([2.0 * C.real, -2.0 * C.imag], -1)
-        g = np.concatenate([q.real, q.imag], -1)
-        k0 = 2.0 * (C * q).sum(-1).real
-        return tuple(torch.from_numpy(x).to(args[0].device) for x in (h, g, k0))
+        return torch.from_numpy(q).to(args[0].device)
 
     @staticmethod
     @np.errstate(all="ignore")  # out of range as the value is: the caller looks at both
-    def backward(ctx: Any, *bars: Tensor) -> Any:
+    def backward(ctx: Any, bar: Tensor) -> Any:
         lam, C, L = (array(a) for a in ctx.saved_tensors)
-        sums_h, sums_s, product_h, product_s, hermitian, symmetric, q = _covariances(
+        sums_h, sums_s, product_h, product_s, hermitian, symmetric, _ = _covariances(
             ctx.shared, lam, C, L
         )
-        h_bar, g_bar, k0_bar = (array(b) for b in bars)
+        q_bar = array(bar)
         P = lam.shape[-1]
-        q_bar = g_bar[..., :P] + 1j * g_bar[..., P:] + 2.0 * C.conj() * k0_bar[..., None]
-        C_bar = 2.0 * (h_bar[..., :P] - 1j * h_bar[..., P:]) + 2.0 * q.conj() * k0_bar[..., None]
-        C_bar = C_bar + q_bar.conj() @ hermitian + q_bar @ symmetric.conj()
+        C_bar = q_bar.conj() @ hermitian + q_bar @ symmetric.conj()
         # The covariances, summed over outputs.
         hermitian_bar = _transpose(q_bar) @ C
         symmetric_bar = _transpose(q_bar) @ C.conj()
@@ -80,8 +76,7 @@ class _OutputRows(torch.autograd.Function):
         product_s_bar = -symmetric_bar / sums_s.conj()
         L_bar = product_h_bar @ L + _transpose(product_h_bar.conj()) @ L
         L_bar = L_bar + (product_s_bar + _transpose(product_s_bar)) @ L.conj()
-        device = bars[0].device
-        return (None, *(torch.from_numpy(x).to(device) for x in (lam_bar, C_bar, L_bar)))
+        return (None, *(torch.from_numpy(x).to(bar.device) for x in (lam_bar, C_bar, L_bar)))
 
 
 class _Propagators(torch.autograd.Function):
@@ -105,12 +100,18 @@ class _Propagators(torch.autograd.Function):
         return None, torch.from_numpy(lam_bar.sum(-2)).to(bars[0].device)
 
 
+def output_covariance(modes: Modes) -> Tensor:
+    """Covariance q (*b, n_y, P) of each mode with each output."""
+    args, batch = flatten_batch([modes.poles, modes.C, modes.L], [1, 2, 2])
+    q = run(_OutputCovariance, (modes.noise == "shared",), *args)
+    return q.reshape(batch + q.shape[1:])
+
+
 def output_rows(modes: Modes) -> tuple[Tensor, Tensor, Tensor]:
     """Rows h, g (*b, n_y, 2P) and variances k0 (*b, n_y) of the semiseparable recursion."""
-    args, batch = flatten_batch([modes.poles, modes.C, modes.L], [1, 2, 2])
-    out = run(_OutputRows, (modes.noise == "shared",), *args)
-    h, g, k0 = (x.reshape(batch + x.shape[1:]) for x in out)
-    return h, g, k0
+    q = output_covariance(modes)
+    g = torch.cat([q.real, q.imag], dim=-1)
+    return output_row(modes), g, 2.0 * (modes.C * q).sum(-1).real
 
 
 def propagators(modes: Modes, steps: Tensor) -> tuple[Tensor, Tensor]:

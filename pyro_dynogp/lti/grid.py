@@ -16,11 +16,13 @@ from pyro_dynogp.support.tensors import Numbers, as_tensor
 class TimeGrid:
     """Sampling times, prepared once for all recursions along them.
 
-    Nothing is rounded: two steps count as one only where they are equal to the last bit.
+    Times are numbers with a last digit, so that equal steps differ by what was rounded away: steps
+    closer than two units in the last place of the times count as one, and its length is their
+    mean. Times themselves are left as they are.
 
     Attributes:
         time: (n,) sampling times [s], float64, never decreasing.
-        steps: (m,) the distinct steps d > 0 [s].
+        steps: (m,) the distinct steps d > 0 [s], rising.
         step_index: (n,) int64; `steps[step_index[k]]` leads from sample k - 1 to sample k;
             -1 for the first sample and where a time is repeated.
     """
@@ -73,7 +75,27 @@ def time_grid(time: Numbers | TimeGrid) -> TimeGrid:
             got=f"{values[bad + 1]} after {values[bad]} at index {bad + 1}",
             advice="Sort the samples by time.",
         )
-    distinct, inverse = np.unique(differences, return_inverse=True)
+    distinct, index = _distinct(differences, 2.0 * np.spacing(np.abs(values).max()))
     repeated = int(distinct.shape[0] > 0 and distinct[0] == 0.0)
-    index = np.concatenate([np.array([-1]), inverse.reshape(-1) - repeated]).astype(np.int64)
+    index = np.concatenate([np.array([-1]), index - repeated]).astype(np.int64)
     return TimeGrid(t, torch.as_tensor(distinct[repeated:], device=t.device), index)
+
+
+def _distinct(differences: np.ndarray, rounding: float) -> tuple[np.ndarray, np.ndarray]:
+    """Distinct steps (m,), rising, and which of them each difference (n - 1,) is.
+
+    Differences belong together that lie within `rounding` above the smallest of them; zero stays by
+    itself.
+    """
+    exact, inverse, count = np.unique(differences, return_inverse=True, return_counts=True)
+    first = np.arange(len(exact))  # of those that count as the same
+    near = (np.diff(exact) <= rounding) & (exact[:-1] > 0.0)
+    for k in np.flatnonzero(near) + 1:
+        if exact[k] - exact[first[k - 1]] <= rounding:
+            first[k] = first[k - 1]
+    new = first == np.arange(len(exact))
+    step = np.cumsum(new) - 1
+    members = np.bincount(step, weights=count)
+    mean = np.bincount(step, weights=count * exact) / members
+    alone = members == count[new]
+    return np.where(alone, exact[new], mean), step[inverse.reshape(-1)]

@@ -116,7 +116,9 @@ class _LaterInformation(_Recursion):
         return (None, None, *_Recursion.tensors(kappa_bar, *grads))
 
 
-def run(function: type[torch.autograd.Function], constants: tuple[Any, ...], *args: Tensor) -> Any:
+def run(
+    function: type[torch.autograd.Function], constants: tuple[Any, ...], *args: Tensor | None
+) -> Any:
     """Apply a recursion, letting tensor subclasses (Pyro's provenance tracking) see it as one."""
     if has_torch_function(args):
         return handle_torch_function(run, args, function, constants, *args)

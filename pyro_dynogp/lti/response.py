@@ -23,7 +23,7 @@ from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.primitives import array, flatten_batch, run
 from pyro_dynogp.support.compiled import OPTIONS
 from pyro_dynogp.support.errors import invalid
-from pyro_dynogp.support.tensors import Numbers, as_tensor
+from pyro_dynogp.support.tensors import Numbers, as_tensor, broadcast
 
 
 @njit(**OPTIONS)
@@ -167,6 +167,13 @@ def mean_response(
             "initial_state",
             expected=f"shape (..., {modes.pairs}), one number for each pole",
             got=f"shape {tuple(x0.shape)}",
+        )
+    if initial_state is None and not modes.inputs:  # at rest, and nothing moves it
+        event = (len(grid), modes.outputs) if modes.several_outputs else (len(grid),)
+        batch = broadcast(modes.batch_shape, u.shape[:-2])
+        return Response(
+            torch.zeros((*batch, *event), dtype=torch.float64, device=device),
+            x0.expand((*batch, modes.pairs)),
         )
     phi, gamma = propagators(modes, grid.steps)
     args = [phi, gamma, modes.B, modes.C, u, x0]

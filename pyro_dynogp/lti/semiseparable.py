@@ -17,16 +17,16 @@ from torch import Tensor
 
 from pyro_dynogp.lti import primitives
 from pyro_dynogp.lti.covariance import (
-    output_row,
+    observability,
     state_covariance,
     state_output_covariance,
-    stationary_variance,
 )
-from pyro_dynogp.lti.fused import output_rows, propagators
+from pyro_dynogp.lti.fused import output_covariance, output_rows, propagators
 from pyro_dynogp.lti.grid import TimeGrid, time_grid
+from pyro_dynogp.lti.innovations import innovations
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.support.errors import invalid
-from pyro_dynogp.support.tensors import Numbers, as_tensor
+from pyro_dynogp.support.tensors import Numbers, as_tensor, broadcast
 
 
 class NotPositiveDefiniteError(ValueError):
@@ -39,9 +39,11 @@ class SemiseparableCovariance:
     Args:
         modes: the system, batch shape *b.
         time: (n,) times [s] or a `TimeGrid`.
-        noise_variance: v [output^2], scalar or (*b, N) with N = n n_y; infinite where missing.
+        noise_variance: v [output^2], scalar, (*b, n_y) where it is the same at all times, or
+            (*b, N) with N = n n_y; infinite where missing.
         initial_covariance: (*b, 2P, 2P) covariance of [Re x; Im x] at time[0]; None for the
             stationary one.
+        missing: (*b, N), True where there is no sample; None for nowhere but where v is infinite.
 
     Right-hand sides are (*b, N, R). Every result is differentiable with respect to poles, gains,
     noise variance, initial covariance and right-hand sides.
@@ -53,17 +55,19 @@ class SemiseparableCovariance:
         time: Numbers | TimeGrid,
         noise_variance: Tensor | float = 0.0,
         initial_covariance: Tensor | None = None,
+        missing: Tensor | None = None,
     ) -> None:
         self.modes = modes
         self.grid = time_grid(time).to(modes.poles.device)
-        self.size = len(self.grid) * modes.outputs
+        n, n_y = len(self.grid), modes.outputs
+        self.size = n * n_y
         v = as_tensor(noise_variance, device=modes.poles.device)
         if v.dim() == 0:
-            v = v.expand(self.size)
-        if v.shape[-1] != self.size:
+            v = v.expand(n_y)
+        if v.shape[-1] not in (self.size, n_y):
             raise invalid(
                 "noise_variance",
-                expected=f"a scalar or shape (..., {self.size})",
+                expected=f"a scalar or shape (..., {n_y}) or (..., {self.size})",
                 got=f"shape {tuple(v.shape)}",
             )
         if not bool((v >= 0).all()):
@@ -75,8 +79,34 @@ class SemiseparableCovariance:
                 expected=f"shape (..., {J}, {J}), of [Re x; Im x]",
                 got=f"shape {tuple(initial_covariance.shape)}",
             )
-        self.noise_variance = v
+        self._noise = v.unflatten(-1, (-1, n_y))  # *b, 1 or n, n_y
+        self._absent = missing
         self.initial_covariance = initial_covariance
+        self._variances: Tensor | None = None
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """Shape b of the batch: of modes, noise, what is missing, and initial covariance."""
+        shapes = [self.modes.batch_shape, self._noise.shape[:-2]]
+        if self._absent is not None:
+            shapes.append(self._absent.shape[:-1])
+        if self.initial_covariance is not None:
+            shapes.append(self.initial_covariance.shape[:-2])
+        return broadcast(*shapes)
+
+    @property
+    def noise_variance(self) -> Tensor:
+        """Noise variance of each row (*b, N), infinite where missing."""
+        n, n_y = len(self.grid), self.modes.outputs
+        v = self._noise.expand(*self._noise.shape[:-2], n, n_y).flatten(-2)
+        return v if self._absent is None else v.masked_fill(self._absent, math.inf)
+
+    @cached_property
+    def _explained(self) -> Tensor | None:
+        """Stationary less initial covariance of the state."""
+        if self.initial_covariance is None:
+            return None
+        return state_covariance(self.modes) - self.initial_covariance
 
     @cached_property
     def _rows(self) -> primitives.Generators:
@@ -84,12 +114,10 @@ class SemiseparableCovariance:
         phi, _ = propagators(modes, grid.steps)
         h, g, k0 = output_rows(modes)
         step, out = grid.rows(modes.outputs)
-        if self.initial_covariance is None:
-            S0 = torch.zeros(
-                2 * modes.pairs, 2 * modes.pairs, dtype=torch.float64, device=phi.device
-            )
-        else:
-            S0 = state_covariance(modes) - self.initial_covariance
+        S0 = self._explained
+        if S0 is None:
+            J = 2 * modes.pairs
+            S0 = torch.zeros(J, J, dtype=torch.float64, device=phi.device)
         return primitives.Generators(
             re=phi.real,
             im=phi.imag,
@@ -104,15 +132,38 @@ class SemiseparableCovariance:
     @cached_property
     def _factor(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         e, p, S_end = primitives.factor(self._rows, self.noise_variance)
-        d = p + self.noise_variance
-        if not bool((d > 0).all()):
-            bad = int((~(d > 0)).nonzero()[0][-1])
+        d = self._checked(p + self.noise_variance)
+        return e, p, d, e / d.unsqueeze(-1), S_end
+
+    @cached_property
+    def _rounding(self) -> Tensor:
+        """What innovation variances (*b, 1, n_y) cannot be told from zero: 4 units of rounding."""
+        with torch.no_grad():
+            k0 = 2.0 * (self.modes.C * output_covariance(self.modes)).sum(-1).real
+        return 4.0 * torch.finfo(torch.float64).eps * k0.abs().unsqueeze(-2)
+
+    def _checked(self, d: Tensor) -> Tensor:
+        above = (d.unflatten(-1, (-1, self.modes.outputs)) > self._rounding).flatten(-2)
+        if not bool(above.all()):
+            bad = int((~above).nonzero()[0][-1])
             raise NotPositiveDefiniteError(
                 f"The covariance of the outputs is not positive definite at row {bad} "
                 f"(innovation variance {float(d.detach().reshape(-1, self.size)[0, bad])}). "
                 "Add measurement noise or jitter, or remove repeated times."
             )
-        return e, p, d, e / d.unsqueeze(-1), S_end
+        return d
+
+    def _run(self, residual: Tensor) -> tuple[Tensor, Tensor]:
+        """Innovations and variances of residuals (..., N), of the batch of both."""
+        missing = self._absent
+        if self._noise.shape[-2] > 1 and bool(torch.isinf(self._noise).any()):
+            missing = self.missing
+        z, d = innovations(
+            self.modes, self.grid, self._noise, residual, missing=missing, explained=self._explained
+        )
+        if d.shape[:-1] == self.batch_shape:
+            self._variances = d
+        return z, self._checked(d)
 
     @property
     def missing(self) -> Tensor:
@@ -122,7 +173,12 @@ class SemiseparableCovariance:
     @property
     def innovation_variance(self) -> Tensor:
         """D: variance of each sample given all before it (*b, N); infinite where missing."""
-        return self._factor[2]
+        if "_factor" in self.__dict__:
+            return self._factor[2]
+        if self._variances is None:
+            self._run(torch.zeros(self.size, dtype=torch.float64, device=self._noise.device))
+        assert self._variances is not None
+        return self._checked(self._variances)
 
     @property
     def signal_variance_given_past(self) -> Tensor:
@@ -141,6 +197,8 @@ class SemiseparableCovariance:
 
     def innovations(self, Y: Tensor) -> Tensor:
         """L^{-1} Y (*b, N, R): each sample less its prediction from the samples before."""
+        if Y.shape[-1] == 1:
+            return self._run(Y.squeeze(-1))[0].unsqueeze(-1)
         return primitives.triangular(self._rows, self._factor[3], Y, solve=True)
 
     def root_matmul(self, X: Tensor, *, transpose: bool = False) -> Tensor:
@@ -233,12 +291,13 @@ class SemiseparableCovariance:
 
     def log_prob(self, residual: Tensor) -> Tensor:
         """Log-density (*b, R) of residuals (*b, N, R) under N(0, K), missing rows left out."""
-        z = self.innovations(residual)
-        d = self.innovation_variance.unsqueeze(-1)
-        count = (~self.missing).sum(-1, keepdim=True).to(d.dtype)
-        quadratic = (z.square() / d).sum(-2)
-        constant = count * math.log(2.0 * math.pi)
-        return -0.5 * (quadratic + self.log_determinant().unsqueeze(-1) + constant)
+        if residual.shape[-1] == 1:
+            z, d = (x.unsqueeze(-1) for x in self._run(residual.squeeze(-1)))
+        else:
+            z, d = self.innovations(residual), self.innovation_variance.unsqueeze(-1)
+        missing = torch.isinf(d)
+        terms = z.square() / d + torch.where(missing, 1.0, 2.0 * math.pi * d).log()
+        return -0.5 * terms.sum(-2)
 
     def final_state(self, residual: Tensor) -> Tensor:
         """Mean (*b, P), complex, of the state at the last time given residuals (*b, N).
@@ -269,23 +328,3 @@ class SemiseparableCovariance:
                 got="infinite ones (missing samples)",
                 advice="Leave the missing times out of the time axis.",
             )
-
-
-def observability(modes: Modes, time: Tensor) -> Tensor:
-    """Rows (*b, N, 2P) that read the outputs from the state [Re x; Im x] at time[0]."""
-    decay = torch.exp(modes.poles.unsqueeze(-2) * (time - time[0]).unsqueeze(-1))
-    row = modes.C.unsqueeze(-3) * decay.unsqueeze(-2)  # *b, n, n_y, P
-    real = torch.cat([2.0 * row.real, -2.0 * row.imag], dim=-1)
-    return real.flatten(-3, -2)
-
-
-def jitter_variance(modes: Modes, initial_covariance: Tensor | None, relative: float) -> Tensor:
-    """Variance (*b, 1) that is added to a noise-free trajectory so that it can be factored."""
-    variance = stationary_variance(modes).amax(-1)
-    if initial_covariance is not None:
-        h = output_row(modes)
-        variance = variance + torch.einsum(
-            "...ai,...ij,...aj->...a", h, initial_covariance, h
-        ).amax(-1)
-    tiny = torch.finfo(torch.float64).tiny ** 0.5
-    return (relative * variance + tiny).unsqueeze(-1)

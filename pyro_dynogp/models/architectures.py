@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Unpack
+
+from gpytorch.kernels import Kernel
 
 from pyro_dynogp.layers.noise import Gaussian, Likelihood
 from pyro_dynogp.lti.modes import NoiseStructure
 from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.structure import ModelOptions
 from pyro_dynogp.models.wiring import Dynamic, Layer, Static
 
 
@@ -21,7 +24,7 @@ def LinearDynamicGP(
     feedthrough: bool = True,
     process_noise: bool = True,
     likelihood: Likelihood | None = None,
-    **options: Any,
+    **options: Unpack[ModelOptions],
 ) -> Model:
     """Output = stochastic LTI system driven by the inputs + offset + measurement noise.
 
@@ -54,7 +57,10 @@ def LinearDynamicGP(
 
 
 def Cascade(
-    inputs: int, layers: Sequence[Layer], likelihood: Likelihood | None = None, **options: Any
+    inputs: int,
+    layers: Sequence[Layer],
+    likelihood: Likelihood | None = None,
+    **options: Unpack[ModelOptions],
 ) -> Model:
     """Dynamic and static layers in any order, whose trajectories are sample sites.
 
@@ -79,10 +85,10 @@ def Wiener(
     outputs: int = 1,
     pairs: int = 5,
     inducing: int = 32,
-    kernel: Any = None,
+    kernel: Kernel | None = None,
     process_noise: bool = True,
     likelihood: Likelihood | None = None,
-    **options: Any,
+    **options: Unpack[ModelOptions],
 ) -> Model:
     """Linear dynamics g, then a static nonlinearity f: a sensor that is not linear.
 
@@ -107,10 +113,10 @@ def Hammerstein(
     outputs: int = 1,
     pairs: int = 5,
     inducing: int = 32,
-    kernel: Any = None,
+    kernel: Kernel | None = None,
     process_noise: bool = True,
     likelihood: Likelihood | None = None,
-    **options: Any,
+    **options: Unpack[ModelOptions],
 ) -> Model:
     """A static nonlinearity f of the inputs, then linear dynamics g: a nonlinear actuator.
 
@@ -129,11 +135,11 @@ def WienerHammerstein(
     outputs: int = 1,
     pairs: int | tuple[int, int] = 5,
     inducing: int = 32,
-    kernel: Any = None,
+    kernel: Kernel | None = None,
     width: int = 1,
     process_noise: bool | tuple[bool, bool] = True,
     likelihood: Likelihood | None = None,
-    **options: Any,
+    **options: Unpack[ModelOptions],
 ) -> Model:
     """Linear dynamics g1, a static nonlinearity f, linear dynamics g2.
 
@@ -156,10 +162,10 @@ def NonlinearFeedback(
     outputs: int = 1,
     pairs: int = 1,
     inducing: int = 32,
-    kernel: Any = None,
+    kernel: Kernel | None = None,
     process_noise: bool = True,
     likelihood: Likelihood | None = None,
-    **options: Any,
+    **options: Unpack[ModelOptions],
 ) -> Model:
     """Linear dynamics g whose output comes back through a static nonlinearity f.
 
@@ -188,10 +194,10 @@ def HammersteinWiener(
     outputs: int = 1,
     pairs: int = 5,
     inducing: int | tuple[int, int] = 32,
-    kernel: Any = None,
+    kernel: Kernel | None = None,
     process_noise: bool = True,
     likelihood: Likelihood | None = None,
-    **options: Any,
+    **options: Unpack[ModelOptions],
 ) -> Model:
     """A static nonlinearity f1 of the inputs, linear dynamics g, a static nonlinearity f2.
 

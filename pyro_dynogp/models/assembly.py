@@ -71,7 +71,7 @@ class Assembly:
 def count_states(system: System) -> int:
     """N, the real states of all dynamic layers."""
     layers = system.layers
-    return sum(2 * one.modes.pairs for one in layers if isinstance(one, DynamicSystem))
+    return sum(2 * layer.modes.pairs for layer in layers if isinstance(layer, DynamicSystem))
 
 
 def places_of_outputs(wires: Sequence[Wire]) -> tuple[dict[str, int], int]:
@@ -82,17 +82,17 @@ def places_of_outputs(wires: Sequence[Wire]) -> tuple[dict[str, int], int]:
     random: dict[str, str] = {INPUTS: "known"}
     first: dict[str, int] = {}
     total = 0
-    for one in wires:
-        sources = [random[name] for name in one.sources]
-        if isinstance(one.layer, Dynamic):
-            total += one.channels if "trajectory" in sources else 0
-            random[one.name] = "trajectory"
+    for place in wires:
+        sources = [random[name] for name in place.sources]
+        if isinstance(place.layer, Dynamic):
+            total += place.channels if "trajectory" in sources else 0
+            random[place.name] = "trajectory"
         elif any(kind != "known" for kind in sources):
-            first[one.name] = total
-            total += one.layer.outputs
-            random[one.name] = "function"
+            first[place.name] = total
+            total += place.layer.outputs
+            random[place.name] = "function"
         else:
-            random[one.name] = "known"
+            random[place.name] = "known"
     return first, total
 
 
@@ -120,8 +120,8 @@ class _Assembler:
     def expand(self, x: Tensor, event: int) -> Tensor:
         return x.expand(self.batch + x.shape[x.dim() - event :])
 
-    def sources(self, one: Wire) -> Signal:
-        parts = [self.signals[name] for name in one.sources]
+    def sources(self, place: Wire) -> Signal:
+        parts = [self.signals[name] for name in place.sources]
         known = torch.cat([self.expand(p.known, 2) for p in parts], -1)
         outputs = tuple(o for p in parts for o in p.outputs)
         if all(p.rows is None for p in parts):
@@ -155,26 +155,26 @@ class _Assembler:
             known, self.expand(self.unit_rows(first, count), 2), tuple(range(first, first + count))
         )
 
-    def static(self, one: Wire, layer: StaticSystem) -> Signal:
-        seen = self.sources(one)
+    def static(self, place: Wire, layer: StaticSystem) -> Signal:
+        seen = self.sources(place)
         if seen.rows is not None:
-            back = any(one.name in w.feedback for w in self.system.wires)
-            return self.add_block(seen, layer.function, not one.pathwise, back)
+            back = any(place.name in w.feedback for w in self.system.wires)
+            return self.add_block(seen, layer.function, not place.pathwise, back)
         known = layer(seen.known)
-        if one.last:
+        if place.last:
             self.extra = layer.function.variance(seen.known)
-        return Signal(known, None, (KNOWN,) * one.layer.outputs)
+        return Signal(known, None, (KNOWN,) * place.layer.outputs)
 
-    def dynamic(self, one: Wire, layer: DynamicSystem) -> Signal:
-        seen = self.sources(one)
+    def dynamic(self, place: Wire, layer: DynamicSystem) -> Signal:
+        seen = self.sources(place)
         known = seen.known
         if TRAJECTORY in seen.outputs:  # a trajectory feeds the layer: hold it through an identity
             held = self.add_block(seen, None, False)
             seen = Signal(held.known, held.rows, held.outputs)
             known = held.known
         modes = layer.modes
-        if one.fed:
-            known = torch.cat([known, known.new_zeros((*known.shape[:-1], one.fed))], -1)
+        if place.fed:
+            known = torch.cat([known, known.new_zeros((*known.shape[:-1], place.fed))], -1)
         driven = known if modes.inputs else None
         responded = mean_response(modes, self.grid, driven, layer.first_state)
         response = responded.output
@@ -183,7 +183,7 @@ class _Assembler:
         gain = propagators(modes, self.grid.steps)[1].unsqueeze(-1) * modes.B.unsqueeze(-3)
         E = self.total - self.states
         select = torch.zeros(modes.inputs, E, dtype=torch.complex128)
-        for i, o in enumerate((*seen.outputs, *self.fed_back(one))):
+        for i, o in enumerate((*seen.outputs, *self.fed_back(place))):
             if o >= 0:
                 select[i, o] = 1.0
         self.gains.append(self.expand(gain @ select, 3))
@@ -193,14 +193,14 @@ class _Assembler:
         self.covariances.append(covariance)
         rows = self.state_rows(modes)
         if seen.rows is not None:
-            rows = rows + modes.D[..., : one.channels] @ seen.rows
+            rows = rows + modes.D[..., : place.channels] @ seen.rows
         self.pairs_before += modes.pairs
         return Signal(self.expand(response, 2), rows, (TRAJECTORY,) * modes.outputs)
 
-    def fed_back(self, one: Wire) -> list[int]:
+    def fed_back(self, place: Wire) -> list[int]:
         """Static outputs that come back to a dynamic layer."""
         width = {w.name: w.layer.outputs for w in self.system.wires}
-        return [self.first_output[name] + a for name in one.feedback for a in range(width[name])]
+        return [self.first_output[name] + a for name in place.feedback for a in range(width[name])]
 
     def state_rows(self, modes: Modes) -> Tensor:
         C = self.expand(modes.C, 2)
@@ -237,7 +237,7 @@ class _Assembler:
     def finish(self, noise_sd: Tensor) -> Assembly:
         steps = self.grid.steps
         m = len(steps)
-        phi = [self.expand(propagators(one, steps)[0], 2) for one in self.modes]
+        phi = [self.expand(propagators(modes, steps)[0], 2) for modes in self.modes]
         nothing = torch.zeros((*self.batch, m, 0), dtype=torch.complex128)
         joined = torch.cat(phi, -1) if phi else nothing
         E = self.total - self.states
@@ -268,7 +268,7 @@ class _Assembler:
             ),
             re=joined.real,
             im=joined.imag,
-            Q=self.joint([step_noises(one, steps) for one in self.modes], 3),
+            Q=self.joint([step_noises(modes, steps) for modes in self.modes], 3),
             gamma=torch.cat([gains.real, gains.imag], -2),
             m0=torch.zeros(self.states, dtype=torch.float64),
             P0=self.joint(self.covariances, 2),
@@ -303,11 +303,11 @@ def assemble(
         ValueError: where a static layer of several channels has a kernel that is not radial.
     """
     walk = _Assembler(system, grid, inputs)
-    for one, layer in zip(system.wires, system.layers, strict=True):
+    for place, layer in zip(system.wires, system.layers, strict=True):
         if isinstance(layer, DynamicSystem):
-            walk.signals[one.name] = walk.dynamic(one, layer)
+            walk.signals[place.name] = walk.dynamic(place, layer)
         else:
-            walk.signals[one.name] = walk.static(one, layer)
+            walk.signals[place.name] = walk.static(place, layer)
     return walk.finish(system.noise_sd(inputs, grid) if noise_sd is None else noise_sd)
 
 

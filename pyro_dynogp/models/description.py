@@ -33,13 +33,17 @@ class Part:
 
 def describe(model: Model) -> tuple[Part, ...]:
     """Each part of a model, inputs first, measured output last."""
-    channels = [(in_words(one), one) for one in model.channels]
-    driving = [part for part, one in channels if not one.direct]
-    direct = [replace(part, heading=f"plus {part.heading}") for part, one in channels if one.direct]
+    channels = [(in_words(channel), channel) for channel in model.channels]
+    driving = [part for part, channel in channels if not channel.direct]
+    direct = [
+        replace(part, heading=f"plus {part.heading}")
+        for part, channel in channels
+        if channel.direct
+    ]
     count = model.inputs - model.direct
     inputs = Part("inputs", f"{count} input{'s' if count != 1 else ''}")
     layers = [_layer(layer) for layer in model.layers]
-    plain = model.direct - sum(len(one.names) for one in model.channels if one.direct)
+    plain = model.direct - sum(len(channel.names) for channel in model.channels if channel.direct)
     if plain:
         direct.append(Part("direct inputs", f"plus {plain} direct inputs", joins=True))
     return (inputs, *driving, *layers, *direct, _noise(model.likelihood))

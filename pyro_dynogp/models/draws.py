@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -99,17 +98,17 @@ class Randomness:
         """From torch's generator."""
         states = 0
         innovations, residual = {}, {}
-        for one, layer in zip(system.wires, system.layers, strict=True):
+        for place, layer in zip(system.wires, system.layers, strict=True):
             if isinstance(layer, DynamicSystem):
                 states += 2 * layer.modes.pairs
                 event = (n, layer.modes.outputs) if layer.modes.several_outputs else (n,)
                 if system.has_feedback:
                     event = (n, 2 * layer.modes.pairs)
-                innovations[one.name] = torch.randn(*shape, *event, dtype=torch.float64)
+                innovations[place.name] = torch.randn(*shape, *event, dtype=torch.float64)
             else:
-                assert isinstance(one.layer, Static)
-                event = (one.layer.outputs, one.layer.support)
-                residual[one.name] = torch.randn(*shape, *event, dtype=torch.float64)
+                assert isinstance(place.layer, Static)
+                event = (place.layer.outputs, place.layer.support)
+                residual[place.name] = torch.randn(*shape, *event, dtype=torch.float64)
         return cls(torch.randn(*shape, states, dtype=torch.float64), innovations, residual)
 
     @property
@@ -193,8 +192,8 @@ def draw_layers(
     before = 0
     mean = signals[INPUTS]
     variance = torch.zeros(())
-    for one, layer in zip(system.wires, system.layers, strict=True):
-        x = see(signals, one)
+    for place, layer in zip(system.wires, system.layers, strict=True):
+        x = see(signals, place)
         if isinstance(layer, DynamicSystem):
             modes = layer.modes
             own = slice(before, before + modes.pairs)
@@ -204,19 +203,20 @@ def draw_layers(
             driven = x if modes.inputs else None
             value = mean_response(modes, grid, driven, x0).output
             mean, variance = value, torch.zeros_like(value)
-            if one.name in switches.process_noise:
+            if place.name in switches.process_noise:
                 noise = fresh_noise(modes, grid)
-                value = value + noise.from_innovations(random.innovations[one.name])
+                value = value + noise.from_innovations(random.innovations[place.name])
                 variance = noise.variance.expand(value.shape)
             if not modes.several_outputs:
                 value, mean, variance = (v.unsqueeze(-1) for v in (value, mean, variance))
         else:
+            assert isinstance(place.layer, Static)
             value, mean, variance = draw_static(
-                one.layer, layer, x, random.residual[one.name], switches
+                place.layer.support, layer, x, random.residual[place.name], switches
             )
-            if one.last:
+            if place.last:
                 value = mean
-        signals[one.name] = value
+        signals[place.name] = value
     level = system.level(inputs)
     if level is not None:
         mean = mean + level
@@ -224,11 +224,11 @@ def draw_layers(
 
 
 def draw_static(
-    spec: Any, layer: StaticSystem, x: Tensor, residual: Tensor, switches: Switches
+    support_count: int, layer: StaticSystem, x: Tensor, residual: Tensor, switches: Switches
 ) -> tuple[Tensor, Tensor, Tensor]:
     """One function along x, or its mean; mean and variance at each point."""
     function = layer.function
-    support = support_points(function.locations, spec.support)
+    support = support_points(function.locations, support_count)
     if function.channels > 1:
 
         def at(part: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -20,11 +20,13 @@ from torch import Tensor
 from pyro_dynogp.distributions.pointwise import (
     Moments,
     ahead,
+    innovations,
     left_out,
     one_step,
     prediction_errors,
 )
 from pyro_dynogp.distributions.process import ConditionedLTIProcess, LTIProcess, ObservedLTIProcess
+from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.state import ModalState, propagate
 from pyro_dynogp.models.draws import JointState
 from pyro_dynogp.models.output_process import Components, LayerMoments, OutputProcess
@@ -94,7 +96,7 @@ class ExactOutputs(OutputProcess):
             if physical.modes.inputs:
                 driving = self.inputs - as_tensor(self.scaling.input_offset)
             # A first state that is known leaves the stationary covariance of process noise.
-            state: Any = start or layer.first_state
+            state: ModalState | Tensor | None = start or layer.first_state
             if state is None:
                 state = replace(layer, modes=physical.modes, past=layer.past_inputs).prior_state()
             process = LTIProcess(physical.modes, self.grid, driving, state, offset=physical.offset)
@@ -151,6 +153,25 @@ class ExactOutputs(OutputProcess):
             total = self.process.log_prob(self._to_process(value))
         jacobian = ((~missing).to(torch.float64) * self.scale.log()).sum((-2, -1))
         return (total - jacobian).expand(broadcast(z.shape[:-2], self.batch_shape))
+
+    def innovations(self, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Errors (*b, *event) of one-step predictions and their variances, in record units.
+
+        Of outputs of one time those that follow are given those before. Of a missing sample the
+        error is zero and the variance infinite.
+        """
+        if self.process is not None:
+            error, variance = innovations(self.process, self._to_process(y))
+            if self._physical:
+                return error, variance
+            unit = self.scale if self.several else self.scale[0]
+            return unit * error, unit.square() * variance
+        mean, variance, noise = self._white
+        error, missing = self.scaled(y) - mean, torch.isnan(self.columns(y))
+        error = self.scale * error.masked_fill(missing, 0.0)
+        total = (self.scale.square() * (variance + noise)).expand(error.shape)
+        total = total.masked_fill(missing, torch.inf)
+        return (error, total) if self.several else (error.squeeze(-1), total.squeeze(-1))
 
     def one_step(self, y: Tensor) -> Moments:
         """See `OutputProcess`."""
@@ -288,7 +309,7 @@ class ExactOutputs(OutputProcess):
         return self.process.rsample(sample_shape)
 
 
-def nothing_left(modes: Any) -> ModalState:
+def nothing_left(modes: Modes) -> ModalState:
     """A first state that is zero for certain."""
     J = 2 * modes.pairs
     return ModalState(torch.zeros_like(modes.poles), torch.zeros(J, J, dtype=torch.float64))

@@ -7,9 +7,9 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from pyro_dynogp.data.record import Record
 from pyro_dynogp.distributions.process import LTIProcess
 from pyro_dynogp.models.output_process import OutputProcess
+from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.models.system import DynamicSystem, StaticSystem, see
 from pyro_dynogp.models.wiring import INPUTS, Wire
 
@@ -19,7 +19,7 @@ TINY = 1e-10
 
 
 def observe_explicit(
-    outputs: OutputProcess, record: Record, suffix: str, *, last_integrated: bool
+    outputs: OutputProcess, record: PreparedRecord, suffix: str, *, last_integrated: bool
 ) -> None:
     """Sample every trajectory, then the outputs.
 
@@ -32,7 +32,7 @@ def observe_explicit(
         x = see(signals, wire)
         if isinstance(layer, DynamicSystem):
             driven = x if layer.modes.inputs else None
-            process = LTIProcess(layer.modes, record.time, driven, layer.prior_state())
+            process = LTIProcess(layer.modes, record.grid, driven, layer.prior_state())
             if wire.last and last_integrated:
                 observe_linear(process, outputs, record, suffix)
                 return
@@ -66,17 +66,17 @@ def _sample_function(wire: Wire, layer: StaticSystem, x: Tensor, suffix: str) ->
     return value if several else value.unsqueeze(-1)
 
 
-def outputs_of(record: Record) -> tuple[Tensor | None, Tensor | None]:
+def outputs_of(record: PreparedRecord) -> tuple[Tensor | None, Tensor | None]:
     """Outputs (n,) or (n, n_y) with zeros where missing, and where that is; None for none."""
-    if not record.n_outputs:
+    if not record.has_outputs:
         return None, None
-    y = record.tensors().observations
+    y = record.observations
     missing = torch.isnan(y)
     return (y.masked_fill(missing, 0.0), missing) if bool(missing.any()) else (y, None)
 
 
 def observe_linear(
-    process: LTIProcess, outputs: OutputProcess, record: Record, suffix: str
+    process: LTIProcess, outputs: OutputProcess, record: PreparedRecord, suffix: str
 ) -> None:
     """Observe a dynamic last layer, its trajectory integrated out."""
     system, scale, shift = outputs.system, outputs.scale, outputs.shift
@@ -88,5 +88,5 @@ def observe_linear(
         level, sd = level.squeeze(-1), sd.squeeze(-1)
     driven = process.inputs if modes.inputs else None
     physical = LTIProcess(modes, process.grid, driven, process.initial_state, offset=level)
-    y = record.tensors().observations if record.n_outputs else None
+    y = record.observations if record.has_outputs else None
     pyro.sample(f"y{suffix}", physical.observed(sd), obs=y)

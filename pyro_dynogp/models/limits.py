@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import pyro
 import torch
+from torch import Tensor
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.scaling import Scaling
@@ -28,9 +28,9 @@ def scaled_limits(limits: Limits, scaling: Scaling | None) -> tuple[float, float
             got="None", advice="Use model.scaled_to(record).",
         )  # fmt: skip
     low, high = (
-        sign * math.inf if one is None
-        else (one - float(scaling.output_offset[0])) / float(scaling.output_scale[0])
-        for one, sign in zip(limits, (-1.0, 1.0), strict=True)
+        sign * math.inf if limit is None
+        else (limit - float(scaling.output_offset[0])) / float(scaling.output_scale[0])
+        for limit, sign in zip(limits, (-1.0, 1.0), strict=True)
     )  # fmt: skip
     return low, high
 
@@ -40,21 +40,20 @@ def at_limits(layers: Sequence[Layer], record: Record) -> np.ndarray:
     last = layers[-1]
     if not isinstance(last, Static) or last.limits is None or not record.n_outputs:
         return np.zeros(len(record), dtype=bool)
-    known = [one for one in last.limits if one is not None]
+    known = [limit for limit in last.limits if limit is not None]
     there: np.ndarray = np.isin(record.outputs[:, 0], known)
     return there
 
 
-def count_as_probabilities(at: np.ndarray, outputs: OutputProcess, suffix: str) -> None:
-    """Take outputs that are exactly at a limit for what they are: probabilities.
+def log_probability_scale(at: np.ndarray, outputs: OutputProcess) -> Tensor:
+    """What makes probabilities () or (k,) of the densities of outputs that are exactly at a limit.
 
     Their density, which has no upper bound where the noise vanishes, times sqrt(2 pi) times the
     noise's scale is at most one, as the probability of being beyond the limit is.
 
     Args:
-        at: (n,) where they are. outputs: of the record. suffix: of the record's sites.
+        at: (n,) where they are. outputs: of the record.
     """
-    if at.any():
-        sd = outputs.noise_sd[..., 0]
-        sd = sd.expand((*sd.shape[:-1], len(at)))[..., torch.as_tensor(at)]
-        pyro.factor(f"at_limits{suffix}", (sd.log() + 0.5 * math.log(2.0 * math.pi)).sum(-1))
+    sd = outputs.noise_sd[..., 0]
+    sd = sd.expand((*sd.shape[:-1], len(at)))[..., torch.as_tensor(at)]
+    return (sd.log() + 0.5 * math.log(2.0 * math.pi)).sum(-1)

@@ -3,42 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal, get_args
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import pyro
 import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from pyro_dynogp.data.channels import Channel
-from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.layers.functions import StaticFunction, support_points
-from pyro_dynogp.layers.noise import Gaussian, Likelihood
 from pyro_dynogp.layers.sites import Site, Values, sample
 from pyro_dynogp.layers.static import StaticPrior
-from pyro_dynogp.models.checks import check_direct, check_feedback, check_records, prepare
 from pyro_dynogp.models.explicit import observe_explicit
-from pyro_dynogp.models.limits import at_limits, count_as_probabilities, scaled_limits
+from pyro_dynogp.models.limits import at_limits, log_probability_scale, scaled_limits
 from pyro_dynogp.models.outputs import output_process
-from pyro_dynogp.models.priors import (
-    FLAT,
-    ModesPrior,
-    PriorName,
-    TimeScale,
-    direct_site,
-)
+from pyro_dynogp.models.prepared import Records
+from pyro_dynogp.models.priors import FLAT, ModesPrior, TimeScale, direct_site
+from pyro_dynogp.models.structure import Structure
 from pyro_dynogp.models.system import DynamicSystem, StaticSystem, System
-from pyro_dynogp.models.wiring import Dynamic, Layer, Static, Wire, wire
-from pyro_dynogp.support.errors import invalid
-
-Integrate = Literal["none", "last", "all"]
-InitialState = Literal["auto", "site", "integrated", "zero"]
+from pyro_dynogp.models.wiring import Dynamic, Static, Wire
 
 
 @dataclass(frozen=True)
-class Model:
+class Model(Structure):
     """Dynamic and static layers in any order, then measurement noise: a Pyro model.
 
     `LinearDynamicGP`, `Wiener`, `Hammerstein`, `WienerHammerstein`, `HammersteinWiener` and
@@ -85,129 +73,6 @@ class Model:
 
     # Sites may have a batch dimension on the left: many points go through the model at once.
     takes_batches: ClassVar[bool] = True
-
-    inputs: int
-    layers: tuple[Layer, ...]
-    likelihood: Likelihood = field(default_factory=Gaussian)
-    initial_state: InitialState = "auto"
-    integrate: Integrate = "none"
-    priors: PriorName = "default"
-    direct: int = 0
-    channels: tuple[Channel, ...] = ()
-    scaling: Scaling | None = None
-    output: str | None = None
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.inputs, int) or self.inputs < 0:
-            raise invalid("inputs", expected="a whole number >= 0", got=repr(self.inputs))
-        object.__setattr__(self, "layers", tuple(self.layers))
-        object.__setattr__(self, "channels", tuple(self.channels))
-        if not isinstance(self.likelihood, Likelihood):
-            raise invalid(
-                "likelihood",
-                expected="Gaussian(), StudentT(...) or Heteroscedastic(...)",
-                got=repr(self.likelihood),
-            )
-        for name, choices in (
-            ("priors", get_args(PriorName)),
-            ("integrate", get_args(Integrate)),
-            ("initial_state", get_args(InitialState)),
-        ):
-            if getattr(self, name) not in choices:
-                *most, last = (repr(choice) for choice in choices)
-                expected = f"{', '.join(most)} or {last}"
-                raise invalid(name, expected=expected, got=repr(getattr(self, name)))
-        check_direct(self.inputs, self.direct, self.channels)
-        wires = wire(self.inputs - self.direct, self.layers, self.output)
-        object.__setattr__(self, "_wires", wires)
-        if self.has_feedback:
-            check_feedback(self.integrate, self.likelihood)
-        end = self.output_wire.layer
-        if self.integrate == "last" and not (
-            isinstance(end, Dynamic) and self.likelihood == Gaussian() and not self.direct
-        ):
-            raise invalid(
-                "integrate",
-                expected="'none' or 'all': only a dynamic last layer under constant Gaussian "
-                "noise and without direct inputs can be integrated by itself",
-                got="'last'",
-            )
-
-    @property
-    def wires(self) -> tuple[Wire, ...]:
-        """The layers in their places, with names."""
-        wires: tuple[Wire, ...] = self.__dict__["_wires"]
-        return wires
-
-    @property
-    def output_wire(self) -> Wire:
-        """The layer whose output is measured, in its place."""
-        return next(w for w in self.wires if w.last)
-
-    @property
-    def has_feedback(self) -> bool:
-        """Whether a static layer's output comes back to an earlier layer."""
-        return any(w.feedback for w in self.wires)
-
-    @property
-    def outputs(self) -> int:
-        """n_y, the width of the layer that is measured."""
-        return self.output_wire.layer.outputs
-
-    @property
-    def several_outputs(self) -> bool:
-        """Whether outputs have a dimension of their own."""
-        return self.outputs > 1
-
-    @property
-    def is_linear(self) -> bool:
-        """Whether it is one layer of linear dynamics, whatever the noise."""
-        return len(self.layers) == 1 and isinstance(self.layers[0], Dynamic)
-
-    @property
-    def has_function(self) -> bool:
-        """Whether there is a static layer."""
-        return any(isinstance(layer, Static) for layer in self.layers)
-
-    @property
-    def dynamic(self) -> tuple[tuple[Wire, Dynamic], ...]:
-        """The dynamic layers in their places, first to last."""
-        return tuple((w, w.layer) for w in self.wires if isinstance(w.layer, Dynamic))
-
-    @property
-    def seen_by_functions(self) -> tuple[Wire, ...]:
-        """Dynamic layers with inputs whose trajectory a static layer sees, also through others."""
-        names = {
-            name
-            for place, reader in enumerate(self.wires)
-            if any(isinstance(w.layer, Static) for w in self.wires[place:])
-            for name in reader.sources
-        }
-        return tuple(w for w, _ in self.dynamic if w.channels + w.fed and w.name in names)
-
-    @property
-    def state_sites(self) -> tuple[Wire, ...]:
-        """Dynamic layers whose first state is a site."""
-        if self.initial_state == "site":
-            return tuple(w for w, _ in self.dynamic if w.channels + w.fed)
-        return self.seen_by_functions if self.initial_state == "auto" else ()
-
-    @property
-    def collapsed(self) -> Model:
-        """The same model with all trajectories integrated out."""
-        return replace(self, integrate="all")
-
-    def scaled_to(self, records: Record | Sequence[Record]) -> Model:
-        """The same model with the scaling of the given training record(s)."""
-        return replace(self, scaling=Scaling.from_records(prepare(self, records)))
-
-    def check(self, records: Record | Sequence[Record]) -> tuple[Record, ...]:
-        """Records prepared with the model's channels, whose channels and units fit the model.
-
-        Raises:
-            ValueError: where the number of channels or a unit differs.
-        """
-        return check_records(self, records)
 
     def sites(self, scaling: Scaling) -> tuple[Site, ...]:
         """Sites of the parameters, in the order in which they are sampled.
@@ -340,31 +205,30 @@ class Model:
         """Whether what the inducing values leave open of a static layer is drawn, too."""
         return place.pathwise and self.integrate != "all"
 
-    def __call__(
-        self, records: Record | Sequence[Record], inputs: Sequence[Tensor] | None = None
-    ) -> None:
+    def __call__(self, records: Records, inputs: Sequence[Tensor] | None = None) -> None:
         """Run the Pyro model on one record or on several.
 
         Args:
-            records: with inputs and outputs.
+            records: with inputs and outputs; prepared ones are not checked again.
             inputs: for each record u (k, n, n_u) [input] in place of its own, where every site has
                 k values: each of them with inputs of its own.
         """
-        checked = self.check(records)
-        scaling = self.scaling or Scaling.from_records(checked)
-        system = self.sample_system(scaling)
-        for index, record in enumerate(checked):
-            suffix = "" if len(checked) == 1 else f"_{index}"
+        several = self.prepare(records)
+        system = self.sample_system(several[0].scaling)
+        for index, record in enumerate(several):
+            suffix = "" if len(several) == 1 else f"_{index}"
             here = self.begin(system, self.sample_states(suffix))
-            u = None if inputs is None else inputs[index]
-            outputs = output_process(here, scaling, record, u)
+            along = record if inputs is None else record.with_inputs(inputs[index])
+            outputs = output_process(here, along)
             if self.integrate == "all":
-                y = record.tensors().observations if record.n_outputs else None
+                y = record.observations if record.has_outputs else None
                 pyro.sample(f"y{suffix}", outputs, obs=y)
             else:
                 last = self.integrate == "last"
-                observe_explicit(outputs, record, suffix, last_integrated=last)
-            count_as_probabilities(at_limits(self.layers, record), outputs, suffix)
+                observe_explicit(outputs, along, suffix, last_integrated=last)
+            at = at_limits(self.layers, record.record)
+            if at.any():
+                pyro.factor(f"at_limits{suffix}", log_probability_scale(at, outputs))
 
     def sample_states(self, suffix: str) -> dict[str, Tensor]:
         """Sample what past inputs left at the first sample of a record, by layer."""

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.distributions.pointwise import Moments
-from pyro_dynogp.lti.grid import time_grid
+from pyro_dynogp.lti.grid import TimeGrid, time_grid
 from pyro_dynogp.models.assembly import Assembly, assemble
 from pyro_dynogp.models.draws import JointState
 from pyro_dynogp.models.output_process import LayerMoments, OutputProcess
@@ -37,13 +37,13 @@ class MomentOutputs(OutputProcess):
     @cached_property
     def assembly(self) -> Assembly:
         """The system along the record, written as a problem for the filter."""
-        return self._assembled(self.system, self.grid.time, self.scaled_inputs)
+        return self._assembled(self.system, self.grid, self.scaled_inputs)
 
-    def _assembled(self, system: System, time: Tensor, inputs: Tensor) -> Assembly:
-        noise_sd = self.noise_sd if len(time) == len(self.grid) else None
+    def _assembled(self, system: System, grid: TimeGrid, inputs: Tensor) -> Assembly:
+        noise_sd = self.noise_sd if grid is self.grid else None
         if self.start is None:
-            return assemble(system, time_grid(time), inputs, noise_sd)
-        known = assemble(self.start.first_of(system), time_grid(time), inputs, noise_sd)
+            return assemble(system, grid, inputs, noise_sd)
+        known = assemble(self.start.first_of(system), grid, inputs, noise_sd)
         return replace(known, problem=replace(known.problem, P0=self.start.covariance))
 
     def _problem(self, y: Tensor | None) -> FilterProblem:
@@ -109,7 +109,7 @@ class MomentOutputs(OutputProcess):
             centred = following - as_tensor(self.scaling.input_offset)
             following = centred / as_tensor(self.scaling.input_scale)
         inputs = torch.cat([self.scaled_inputs, following.unsqueeze(-2)], -2)
-        assembly = self._assembled(self.system, time, inputs)
+        assembly = self._assembled(self.system, time_grid(time), inputs)
         z = self.scaled(y)
         z = torch.cat([z, torch.full_like(z[..., :1, :], torch.nan)], -2)
         problem = assembly.with_outputs(z)

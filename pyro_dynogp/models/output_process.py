@@ -13,10 +13,8 @@ import torch
 from pyro.distributions import TorchDistribution, constraints
 from torch import Tensor
 
-from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.distributions.pointwise import Moments
 from pyro_dynogp.distributions.trajectory import real_or_missing
-from pyro_dynogp.lti.grid import TimeGrid, time_grid
 from pyro_dynogp.models.draw_shares import decompose
 from pyro_dynogp.models.draws import (
     JointState,
@@ -26,6 +24,7 @@ from pyro_dynogp.models.draws import (
     noise_variance,
 )
 from pyro_dynogp.models.feedback_draws import draw_outputs
+from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.models.system import DynamicSystem, System
 from pyro_dynogp.support.parallel import seeded
 from pyro_dynogp.support.tensors import as_tensor, broadcast
@@ -70,8 +69,7 @@ class OutputProcess(TorchDistribution):
 
     Args:
         system: layers given their parameters, at the beginning of the record.
-        scaling: of the training record. time: (n,) or a `TimeGrid`.
-        inputs: u (*b, n, n_u) [input].
+        record: times and inputs.
         start: state of all dynamic layers at the first time, where it is not what the system says.
     """
 
@@ -81,19 +79,18 @@ class OutputProcess(TorchDistribution):
     def __init__(
         self,
         system: System,
-        scaling: Scaling,
-        time: np.ndarray | Tensor | TimeGrid,
-        inputs: Tensor,
+        record: PreparedRecord,
         start: JointState | None = None,
         *,
         validate_args: bool | None = None,
     ) -> None:
-        self.system, self.scaling, self.start = system, scaling, start
-        self.grid, self.inputs = time_grid(time), inputs
-        n_y = len(scaling.output_scale)
+        self.system, self.scaling, self.start = system, record.scaling, start
+        self.grid, self.inputs = record.grid, record.inputs
+        self.scaled_inputs = record.scaled_inputs
+        n_y = len(self.scaling.output_scale)
         self.several = n_y > 1
         event = (len(self.grid), n_y) if self.several else (len(self.grid),)
-        batch = broadcast(system.batch_shape, inputs.shape[:-2])
+        batch = broadcast(system.batch_shape, self.inputs.shape[:-2])
         if start is not None:
             batch = broadcast(batch, start.mean.shape[:-1])
         super().__init__(batch, torch.Size(event), validate_args=validate_args)
@@ -119,14 +116,6 @@ class OutputProcess(TorchDistribution):
     def shift(self) -> Tensor:
         """(n_y,): mean of the training outputs."""
         return as_tensor(self.scaling.output_offset)
-
-    @cached_property
-    def scaled_inputs(self) -> Tensor:
-        """Inputs (*b, n, n_u) in standard deviations of the training record."""
-        if not self.inputs.shape[-1]:
-            return self.inputs
-        centred = self.inputs - as_tensor(self.scaling.input_offset)
-        return centred / as_tensor(self.scaling.input_scale)
 
     @cached_property
     def noise_sd(self) -> Tensor:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from pyro_dynogp.data.record import Record
-from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.models.draws import JointState
 from pyro_dynogp.models.exact_outputs import ExactOutputs, has_exact_density
 from pyro_dynogp.models.moment_outputs import MomentOutputs
 from pyro_dynogp.models.output_process import OutputProcess
+from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.models.system import System
 
 
@@ -21,9 +20,7 @@ def engine_for(system: System, start: JointState | None = None) -> type[OutputPr
 
 def output_process(
     system: System,
-    scaling: Scaling,
-    record: Record,
-    inputs: Tensor | None = None,
+    record: PreparedRecord,
     *,
     start: JointState | None = None,
     noise_sd: Tensor | None = None,
@@ -31,13 +28,11 @@ def output_process(
     """Measured outputs of a system along a record.
 
     Args:
-        system: at the beginning of the record. scaling: of the training record.
-        record: times, and inputs where they are not given. inputs: u (*b, n, n_u) [input].
+        system: at the beginning of the record. record: times and inputs.
         start: state at the first time, where it is not what the system says.
         noise_sd: (*b, n, n_y) of scaled outputs, where noise depends on more than the record.
     """
-    u = record.tensors().inputs if inputs is None else inputs
-    process = engine_for(system, start)(system, scaling, record.time, u, start)
+    process = engine_for(system, start)(system, record, start)
     if noise_sd is not None:
         process.noise_sd = noise_sd
     return process

@@ -31,12 +31,11 @@ from pyro_dynogp.distributions.decay import LogDecayRate
 from pyro_dynogp.distributions.shared_scale import SharedScaleNormal
 from pyro_dynogp.layers.sites import Site, Values, sample
 from pyro_dynogp.lti.modes import Modes, NoiseStructure
+from pyro_dynogp.models.horseshoe import horseshoe, horseshoe_sites
 from pyro_dynogp.support.errors import invalid
 
 PriorName = Literal["default", "paper"]
 
-# Scale of the horseshoe on the noise gains (paper, appendix "Implementation").
-HORSESHOE_SCALE = 0.1
 # Gains of a pair for an input of unit size, a priori, and the degrees of freedom of that size.
 GAIN_SCALE, GAIN_FREEDOM = 0.3, 3.0
 # Least ratio of frequency to decay rate of a pair.
@@ -108,41 +107,6 @@ def numerators(poles: Tensor, residue: Tensor) -> Tensor:
     """Inverse of `residues`: b1 and b0 (*b, P, n, 2)."""
     b0 = -2.0 * (residue * poles.unsqueeze(-1).conj()).real
     return torch.stack([2.0 * residue.real, b0], -1)
-
-
-def horseshoe_sites(
-    name: str, *shape: int, dims: tuple[str, ...], positive: bool = False, growth: float = 1.0
-) -> tuple[Site, Site]:
-    """Sites of a horseshoe over rows, hierarchical and non-centred.
-
-    ``<name>_local_scale`` (shape[0],) half-Cauchy(1) and ``<name>_unit`` standard normal, or
-    half-normal if `positive`. Their density is proper, unlike the horseshoe density itself, whose
-    mode at zero is infinite.
-
-    Source: Carvalho, Polson & Scott, Proc. AISTATS 5:73 (2009).
-    """
-    local = dist.HalfCauchy(torch.ones(shape[:1], dtype=torch.float64)).to_event(1)
-    ones = torch.ones(shape, dtype=torch.float64)
-    unit = dist.HalfNormal(ones) if positive else dist.Normal(0.0 * ones, ones)
-    return (
-        Site(f"{name}_local_scale", local, dims[:1]),
-        Site(f"{name}_unit", unit.to_event(len(shape)), dims, growth=growth),
-    )
-
-
-def horseshoe(name: str, values: Values, rank: int, scale: float = HORSESHOE_SCALE) -> Tensor:
-    """Scale * local * unit (*b, *shape), of the sites of `horseshoe_sites`; rank: of the shape."""
-    local, unit = values[f"{name}_local_scale"], values[f"{name}_unit"]
-    return scale * local.reshape(local.shape + (1,) * (rank - 1)) * unit
-
-
-def sample_horseshoe(
-    name: str, *shape: int, scale: float = HORSESHOE_SCALE, positive: bool = False
-) -> Tensor:
-    """Sample a horseshoe of the given scale over rows (*b, *shape); see `horseshoe_sites`."""
-    dims = tuple(f"{name}_dim_{axis}" for axis in range(len(shape)))
-    sites = horseshoe_sites(name, *shape, dims=dims, positive=positive)
-    return horseshoe(name, sample(sites), len(shape), scale)
 
 
 @dataclass(frozen=True)

@@ -5,24 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.layers.functions import StaticFunction
 from pyro_dynogp.layers.noise import Noise
 from pyro_dynogp.lti.covariance import state_covariance
-from pyro_dynogp.lti.grid import time_grid
+from pyro_dynogp.lti.grid import TimeGrid, time_grid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import Response, mean_response
 from pyro_dynogp.lti.state import ModalState
 from pyro_dynogp.models.past_inputs import initial_mean, past_input_covariance, with_direct
 from pyro_dynogp.models.wiring import INPUTS, Wire
 from pyro_dynogp.support.errors import invalid
-from pyro_dynogp.support.tensors import as_tensor, broadcast
+from pyro_dynogp.support.tensors import Numbers, as_tensor, broadcast
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,12 +63,12 @@ class DynamicSystem:
         past = self.past_inputs
         return ModalState(torch.zeros_like(self.modes.poles), state_covariance(self.modes) + past)
 
-    def response(self, x: Tensor, time: Any) -> Response:
+    def response(self, x: Tensor, time: Numbers | TimeGrid) -> Response:
         """What x (*b, n, d) alone causes, from the known first state or rest."""
         driven = x if self.modes.inputs else None
         return mean_response(self.modes, time, driven, self.first_state)
 
-    def mean(self, x: Tensor, time: Any) -> Tensor:
+    def mean(self, x: Tensor, time: Numbers | TimeGrid) -> Tensor:
         """Output (*b, n, w) that x (*b, n, d) alone causes, from the known first state or rest."""
         value = self.response(x, time).output
         return value if self.modes.several_outputs else value.unsqueeze(-1)
@@ -94,7 +92,7 @@ class StaticSystem:
     support: Tensor | None = None
     residual: Tensor | None = None
 
-    def mean(self, x: Tensor, time: Any) -> Tensor:
+    def mean(self, x: Tensor, time: Numbers | TimeGrid) -> Tensor:
         """Mean of the function along x (*b, n, d): (*b, n, e), at whatever times."""
         return self.function.mean(x)
 
@@ -168,19 +166,19 @@ class System:
         direct = inputs[..., -self.direct.shape[-1] :] @ self.direct.mT
         return direct if level is None else level + direct
 
-    def undisturbed(self, inputs: Tensor, time: Any) -> Tensor:
+    def undisturbed(self, inputs: Tensor, time: Numbers | TimeGrid) -> Tensor:
         """Output (*b, n, n_y) that inputs (*b, n, n_u) alone cause, static layers at their mean.
 
         Dynamic layers start from the first state that is known of them, else at rest.
         """
         grid, signals = time_grid(time), {INPUTS: self.driving(inputs)}
-        for one, layer in zip(self.wires, self.layers, strict=True):
-            signals[one.name] = layer.mean(see(signals, one), grid)
+        for place, layer in zip(self.wires, self.layers, strict=True):
+            signals[place.name] = layer.mean(see(signals, place), grid)
         output = signals[self.wires[-1].name]
         level = self.level(inputs)
         return output if level is None else output + level
 
-    def noise_sd(self, inputs: Tensor, time: Any) -> Tensor:
+    def noise_sd(self, inputs: Tensor, time: Numbers | TimeGrid) -> Tensor:
         """Scale (*b, n, n_y) of the measurement noise along scaled inputs (*b, n, n_u).
 
         Args:
@@ -279,31 +277,17 @@ class System:
         Raises:
             ValueError: where there is no such layer.
         """
-        for one, system in zip(self.wires, self.layers, strict=True):
-            if one.name == name:
+        for place, system in zip(self.wires, self.layers, strict=True):
+            if place.name == name:
                 return system
-        names = [one.name for one in self.wires]
+        names = [place.name for place in self.wires]
         raise invalid("name", expected=f"one of the layers {names}", got=repr(name))
 
 
-def see(signals: dict[str, Tensor], one: Wire) -> Tensor:
+def see(signals: dict[str, Tensor], place: Wire) -> Tensor:
     """What a layer sees (*b, n, channels): its sources side by side."""
-    parts = [signals[name] for name in one.sources]
+    parts = [signals[name] for name in place.sources]
     if len(parts) == 1:
         return parts[0]
     batch = broadcast(*(p.shape[:-2] for p in parts))
     return torch.cat([p.expand(batch + p.shape[-2:]) for p in parts], -1)
-
-
-def scaled_inputs(scaling: Scaling, record: Record, inputs: Tensor | None = None) -> Tensor:
-    """Inputs (*b, n, n_u), by default a record's, in standard deviations of the training record."""
-    u = record.tensors().inputs if inputs is None else inputs
-    if not u.shape[-1]:
-        return u
-    return (u - as_tensor(scaling.input_offset)) / as_tensor(scaling.input_scale)
-
-
-def scaled_outputs(scaling: Scaling, record: Record) -> Tensor:
-    """Outputs (n, n_y) of a record, in standard deviations of the training record."""
-    y = record.tensors().outputs
-    return (y - as_tensor(scaling.output_offset)) / as_tensor(scaling.output_scale)

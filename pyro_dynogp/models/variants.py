@@ -32,7 +32,7 @@ def without_channel(model: Model, channel: Channel) -> Model:
         model,
         inputs=model.inputs - less,
         direct=model.direct - count_direct([channel]),
-        channels=tuple(one for one in model.channels if one != channel),
+        channels=tuple(other for other in model.channels if other != channel),
     )
 
 

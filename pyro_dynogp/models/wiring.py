@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
+
+from gpytorch.kernels import Kernel
 
 from pyro_dynogp.lti.modes import NoiseStructure
 from pyro_dynogp.support.errors import invalid
@@ -64,7 +66,7 @@ class Static:
 
     outputs: int = 1
     inducing: int = 32
-    kernel: Any = None
+    kernel: Kernel | None = None
     mean: Literal["constant", "linear"] | None = None
     limits: Limits | None = None
     skip: tuple[str, ...] = ()
@@ -274,7 +276,7 @@ def _check_layer(name: str, layer: Layer) -> None:
 
 def _check_limits(name: str, layer: Static, channels: int, last: bool) -> None:
     assert layer.limits is not None
-    known = [one for one in layer.limits if one is not None]
+    known = [limit for limit in layer.limits if limit is not None]
     if len(layer.limits) != 2 or not known or known != sorted(set(known)):
         raise invalid(
             f"limits of layer {name!r}",

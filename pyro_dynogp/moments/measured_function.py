@@ -164,12 +164,8 @@ def function_terms(i, y, R, centre, p, layout, values, work):
         i: static layer f. y: measured, without the output's known part. R: variance of the noise.
         centre, p: mean c and variance of g.
     """
-    root = math.sqrt(p)
-    _evaluate(i, layout, values, centre, root, work)
-    at, weights = work.at, work.weights
-    l = _weigh(y, R, layout.share, layout.multiple, at, weights)
-    mean, variance = _moments(y, R, layout.multiple, at, weights)
-    return l - _HALF_LOG_2PI, mean / root, (1.0 - variance) / p
+    _evaluate(i, layout, values, centre, math.sqrt(p), work)
+    return function_given(y, R, p, layout, work)
 
 
 @njit(**BORROWING)
@@ -266,6 +262,22 @@ def _evaluate_adjoint(i, layout, values, bars, centre, root, work):
     bars.low[i] -= centre_bar
     bars.spacing[i] += spacing_bar
     return centre_bar, root_bar
+
+
+@njit(**BORROWING)
+def function_given(y, R, p, layout, work):
+    """What `function_terms` returns, at the c and p of the last `function_moments`."""
+    root = math.sqrt(p)
+    at, weights = work.at, work.weights
+    l = _weigh(y, R, layout.share, layout.multiple, at, weights)
+    mean, variance = _moments(y, R, layout.multiple, at, weights)
+    return l - _HALF_LOG_2PI, mean / root, (1.0 - variance) / p
+
+
+@njit(**BORROWING)
+def function_density(y, R, layout, work):
+    """Its value l alone."""
+    return _weigh(y, R, layout.share, layout.multiple, work.at, work.weights) - _HALF_LOG_2PI
 
 
 @njit(**BORROWING)

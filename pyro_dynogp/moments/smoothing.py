@@ -14,9 +14,13 @@ import numpy as np
 from numba import njit
 
 from pyro_dynogp.lti.arithmetic import SEGMENT, dot, times
-from pyro_dynogp.moments.filtering import before_data, enter, inner, measure, output_terms, seen
+from pyro_dynogp.moments.filtering import before_data, enter, inner, measure, seen, width
 from pyro_dynogp.moments.layout import FLOOR, workspace
-from pyro_dynogp.moments.measured_function import function_moments, function_terms
+from pyro_dynogp.moments.measured_function import (
+    function_density,
+    function_given,
+    function_moments,
+)
 from pyro_dynogp.moments.noise import noise_terms
 from pyro_dynogp.moments.segments import replay, restore, room
 from pyro_dynogp.moments.state import step_back, update
@@ -47,14 +51,15 @@ def _noise_free(time, o, layout, values, centre, p, work):
 
 @njit(**BORROWING)
 def _predict(time, o, layout, values, centre, p, work, found):
-    """Write what `_noise_free` returns, and the log-density of the measured output."""
+    """Write what `_noise_free` returns, and the log-density of the measured output.
+
+    Evaluates a measured function once for both.
+    """
     found[0], found[1] = _noise_free(time, o, layout, values, centre, p, work)
     y = values.y[time, o] - values.y_offset[time, o]
     R = values.R[time, o]
     if layout.measured >= 0:
-        i = layout.measured
-        at = centre + values.offset[time, layout.g_start[i]]
-        l, _, _ = function_terms(i, y, R, at, max(p, 0.0) + FLOOR, layout, values, work)
+        l = function_density(y, R, layout, work)
     else:
         l, _, _ = noise_terms(y - centre, p, R, layout.share, layout.multiple)
     found[2] = np.nan if math.isnan(y) else l
@@ -64,7 +69,7 @@ def _predict(time, o, layout, values, centre, p, work, found):
 def _predict_all(time, layout, values, m, P, c, work, found):
     """What `_predict` writes, of all outputs of a sample, to found (3, n, n_y)."""
     for o in range(values.y.shape[1]):
-        h = seen(o, layout, values)
+        h = seen(o, layout, values)[: m.shape[0]]
         p = _quadratic(P, h, c)
         _predict(time, o, layout, values, dot(h, m), p, work, found[:, time, o])
 
@@ -80,7 +85,7 @@ def predict_ahead(layout, values, horizon):
     n = layout.step.shape[0]
     n_y = values.y.shape[1]
     N = values.m0.shape[0]
-    A = values.G.shape[1]
+    A = width(layout, values)
     S = inner(layout)
     found = np.empty((3, n, n_y))
     m, P = before_data(values, A)
@@ -129,7 +134,7 @@ def _before_outputs(time, k, layout, values, bar, L, m, P, t, work, kept, cavity
     for o in range(values.y.shape[1] - 1, -1, -1):
         if math.isnan(values.y[time, o]):
             continue
-        h = seen(o, layout, values)
+        h = seen(o, layout, values)[:A]
         c = kept.C[o]
         update(P, m, c, -alphas[o], -betas[o])
         along = dot(c, bar)
@@ -191,7 +196,8 @@ def smooth(layout, values, rows, means, covariances):
     means, covariances: what `filtering.run` kept at the segments.
     """
     cavity = np.empty((3, 0, values.y.shape[1]))
-    return _backwards(layout, values, rows, means, covariances, cavity)
+    S = layout.channels.shape[0]
+    return _backwards(layout, values, S, rows, means, covariances, cavity)
 
 
 @njit(**OPTIONS)
@@ -200,19 +206,21 @@ def leave_one_out(layout, values, means, covariances):
 
     NaN where the sample is missing. Exact for linear cascades with Gaussian noise.
     """
-    rows = np.empty((0, values.G.shape[1]))
+    rows = np.empty((0, width(layout, values)))
     cavity = np.full((3, values.y.shape[0], values.y.shape[1]), np.nan)
-    _backwards(layout, values, rows, means, covariances, cavity)
+    _backwards(layout, values, inner(layout), rows, means, covariances, cavity)
     return cavity[0], cavity[1], cavity[2]
 
 
 @njit(**OPTIONS)
-def _backwards(layout, values, rows, means, covariances, cavity):
-    """What `smooth` returns; writes what `leave_one_out` does to cavity, unless that is empty."""
+def _backwards(layout, values, S, rows, means, covariances, cavity):
+    """What `smooth` returns; writes what `leave_one_out` does to cavity, unless that is empty.
+
+    S: how many static layers are appended. rows: (r, A) of the state and these.
+    """
     n = layout.step.shape[0]
     N = values.m0.shape[0]
-    A = values.G.shape[1]
-    S = layout.channels.shape[0]
+    A = rows.shape[1]
     mean = np.empty((n, A))
     variance = np.empty((n, rows.shape[0]))
     m = np.zeros(A)
@@ -257,7 +265,7 @@ def innovate(layout, values):
     n = layout.step.shape[0]
     n_y = values.y.shape[1]
     N = values.m0.shape[0]
-    A = values.G.shape[1]
+    A = width(layout, values)
     found = np.full((3, n, n_y), np.nan)
     m, P = before_data(values, A)
     work = workspace(layout, values)
@@ -270,12 +278,17 @@ def innovate(layout, values):
         for o in range(n_y):
             if math.isnan(values.y[time, o]):
                 continue
-            h = seen(o, layout, values)
+            h = seen(o, layout, values)[:A]
             p = _quadratic(P, h, c)
             mean, variance = _noise_free(time, o, layout, values, dot(h, m), p, work)
-            l, alpha, beta = output_terms(time, o, layout, values, m, P, c, work)
+            R = values.R[time, o]
+            y = values.y[time, o] - values.y_offset[time, o]
+            if layout.measured >= 0:
+                l, alpha, beta = function_given(y, R, max(p, 0.0) + FLOOR, layout, work)
+            else:
+                l, alpha, beta = noise_terms(y - dot(h, m), p, R, layout.share, layout.multiple)
             found[0, time, o] = values.y[time, o] - mean
-            found[1, time, o] = variance + values.R[time, o]
+            found[1, time, o] = variance + R
             found[2, time, o] = l
             update(P, m, c, alpha, beta)
     return found[0], found[1], found[2]

@@ -9,8 +9,8 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-from pyro_dynogp.data.record import Record
 from pyro_dynogp.models.outputs import output_process
+from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.models.system import System
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ def unknown_beginning(fit: Fitted) -> System:
     return fit.model.begin(fit.system, {})
 
 
-def beginning(fit: Fitted, record: Record, *, predicting: bool = False) -> System:
+def beginning(fit: Fitted, record: PreparedRecord, *, predicting: bool = False) -> System:
     """The fitted system at the beginning of a record.
 
     On a training record the first state is that of the posterior draws. On another record that of
@@ -33,12 +33,12 @@ def beginning(fit: Fitted, record: Record, *, predicting: bool = False) -> Syste
     numbers that describe it, at the mode of the parameters. (For others it is integrated out.)
 
     Args:
-        fit: the fit. record: prepared, along which.
+        fit: the fit. record: along which.
         predicting: whether first states that can be integrated out are unknown on training
             records, too: predictions serve every record in the same way.
     """
     model = fit.model
-    if not model.state_sites or not record.n_outputs:
+    if not model.state_sites or not record.has_outputs:
         return unknown_beginning(fit)
     index = training_index(fit, record)
     if index is not None:
@@ -51,23 +51,20 @@ def beginning(fit: Fitted, record: Record, *, predicting: bool = False) -> Syste
     return model.begin(fit.system, states)
 
 
-def training_index(fit: Fitted, record: Record) -> int | None:
-    """Index of a record among the training records, as measured or as the model sees them."""
-    for index, known in enumerate(fit.records):
-        if record.fingerprint in (known.fingerprint, fit.model.check(known)[0].fingerprint):
-            return index
-    return None
+def training_index(fit: Fitted, record: PreparedRecord) -> int | None:
+    """Index of a record among the training records."""
+    own = record.record.fingerprint
+    return next((i for i, known in enumerate(fit.records) if known.fingerprint == own), None)
 
 
-def estimate(fit: Fitted, record: Record) -> dict[str, Tensor]:
+def estimate(fit: Fitted, record: PreparedRecord) -> dict[str, Tensor]:
     """Most probable first state of a record, as standard normal numbers (2P,) by layer.
 
     Of layers that a static layer sees.
     """
     model = fit.model
-    head = record[: min(SAMPLES, len(record))]
+    head = PreparedRecord.of(record.record[:SAMPLES], record.scaling)
     system = fit.system_at(fit.mode)
-    y = head.tensors().observations
     seen = model.seen_by_functions
     sizes = {wire.name: 2 * layer.pairs for wire, layer in model.dynamic if wire in seen}
     total = sum(sizes.values())
@@ -80,8 +77,8 @@ def estimate(fit: Fitted, record: Record) -> dict[str, Tensor]:
     def energy(x: np.ndarray) -> tuple[float, np.ndarray]:
         with torch.enable_grad():  # predictions are made without
             z = torch.tensor(x, requires_grad=True)
-            outputs = output_process(model.begin(system, split(z)), fit.scaling, head)
-            value = 0.5 * z.square().sum() - outputs.log_prob(y)
+            outputs = output_process(model.begin(system, split(z)), head)
+            value = 0.5 * z.square().sum() - outputs.log_prob(head.observations)
             (gradient,) = torch.autograd.grad(value, z)
         return float(value.detach()), gradient.numpy()
 

@@ -10,9 +10,10 @@ import torch
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.models.outputs import output_process
-from pyro_dynogp.models.system import DynamicSystem, scaled_inputs
+from pyro_dynogp.models.prepared import PreparedRecord
+from pyro_dynogp.models.system import DynamicSystem
 from pyro_dynogp.prediction.first_state import beginning
-from pyro_dynogp.prediction.records import one_record
+from pyro_dynogp.prediction.records import prepared
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.tensors import as_tensor
 
@@ -40,16 +41,20 @@ class LayerTrajectory:
 
 
 def layers(fit: Fitted, record: Record) -> dict[str, LayerTrajectory]:
+    """See `Fit.layers`."""
+    return trajectories(fit, prepared(fit, record))
+
+
+def trajectories(fit: Fitted, along: PreparedRecord) -> dict[str, LayerTrajectory]:
     """Smoothed trajectories of all layers given a record's inputs and outputs."""
-    record = one_record(fit, record)
     with torch.no_grad():
-        outputs = output_process(beginning(fit, record), fit.scaling, record)
-        smoothed = outputs.smooth(record.tensors().observations if record.n_outputs else None)
+        outputs = output_process(beginning(fit, along), along)
+        smoothed = outputs.smooth(along.observations if along.has_outputs else None)
     found = {}
     for name, layer in smoothed.items():
         sd = np.sqrt((layer.sd**2).mean(0) + layer.mean.var(0))
         found[name] = LayerTrajectory(
-            name, record.time, layer.mean.mean(0), sd, layer.mean, layer.sd
+            name, along.record.time, layer.mean.mean(0), sd, layer.mean, layer.sd
         )
     return found
 
@@ -83,9 +88,9 @@ def static_function(
     wire = wires[name]
     if not 0 <= channel < wire.channels:
         raise invalid("channel", expected=f"0 to {wire.channels - 1}", got=repr(channel))
-    record = one_record(fit, record)
-    found = {k: v.mean for k, v in layers(fit, record).items()}
-    found["inputs"] = fit.system.driving(scaled_inputs(fit.scaling, record)).numpy()
+    along = prepared(fit, record)
+    found = {k: v.mean for k, v in trajectories(fit, along).items()}
+    found["inputs"] = fit.system.driving(along.scaled_inputs).numpy()
     seen = np.concatenate([found[source] for source in wire.sources], -1)
     low, high = seen[:, channel].min(), seen[:, channel].max()
     margin = 0.1 * (high - low)

@@ -13,9 +13,10 @@ from pyro_dynogp.models.draws import variance_multiples
 from pyro_dynogp.models.exact_outputs import ExactOutputs, spread_evenly
 from pyro_dynogp.models.output_process import OutputProcess, flat
 from pyro_dynogp.models.outputs import output_process
+from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.prediction.first_state import beginning, unknown_beginning
 from pyro_dynogp.prediction.prediction import Parts, Prediction
-from pyro_dynogp.prediction.records import following, gap_between, one_record
+from pyro_dynogp.prediction.records import following, prepared
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.parallel import seeded
 
@@ -32,12 +33,12 @@ def simulate(
     fit: Fitted, record: Record, process_noise: bool = True, samples: int = 200, seed: int = 0
 ) -> Prediction:
     """See `Fit.simulate`."""
-    record = one_record(fit, record)
+    along = prepared(fit, record)
     with torch.no_grad():
         system = unknown_beginning(fit)
         system = system if process_noise else system.without_process_noise
-        outputs = output_process(system, fit.scaling, record)
-        return _forward(fit, record, outputs, samples, seed, "simulation")
+        outputs = output_process(system, along)
+        return _forward(fit, along, outputs, samples, seed, "simulation")
 
 
 def forecast(
@@ -49,26 +50,25 @@ def forecast(
     seed: int = 0,
 ) -> Prediction:
     """See `Fit.forecast`."""
-    past, future = following(fit, past, future)
-    gap = gap_between(past, future)
-    if not past.n_outputs:
+    earlier, later, gap = following(fit, past, future)
+    if not earlier.has_outputs:
         raise invalid("past", expected="outputs to start from", got="none")
     with torch.no_grad():
-        before = output_process(beginning(fit, past, predicting=True), fit.scaling, past)
-        ahead = future.tensors().inputs
-        y = past.tensors().observations
-        start = before.state_after(y, gap, ahead[0], process_noise=process_noise)
+        before = output_process(beginning(fit, earlier, predicting=True), earlier)
+        start = before.state_after(
+            earlier.observations, gap, later.inputs[0], process_noise=process_noise
+        )
         # Noise that follows the output continues from where the past has brought the output.
         time = np.append(past.time, past.time[-1] + gap + (future.time - future.time[0]))
         system = fit.system if process_noise else fit.system.without_process_noise
-        outputs = output_process(system, fit.scaling, future, start=start)
+        outputs = output_process(system, later, start=start)
         inputs = torch.cat([before.scaled_inputs, outputs.scaled_inputs])
         outputs.noise_sd = before.system.noise_sd(inputs, time)[..., len(past) :, :]
-        return _forward(fit, future, outputs, samples, seed, "forecast")
+        return _forward(fit, later, outputs, samples, seed, "forecast")
 
 
 def _forward(
-    fit: Fitted, record: Record, outputs: OutputProcess, samples: int, seed: int, kind: str
+    fit: Fitted, record: PreparedRecord, outputs: OutputProcess, samples: int, seed: int, kind: str
 ) -> Prediction:
     """Outputs from a first state and the inputs."""
     found = outputs.components(samples=samples, seed=seed, several_channels=not fit.collapsed)
@@ -76,12 +76,12 @@ def _forward(
         warn_of_divergence(fit, record, found.mean, kind)
     names = fit.scaling.output_names
     return Prediction(
-        record.time, names, found.mean, found.variance, found.noise_variance,
+        record.record.time, names, found.mean, found.variance, found.noise_variance,
         Parts(found.parts), found.draw, kind,
     )  # fmt: skip
 
 
-def warn_of_divergence(fit: Fitted, record: Record, runs: np.ndarray, kind: str) -> None:
+def warn_of_divergence(fit: Fitted, record: PreparedRecord, runs: np.ndarray, kind: str) -> None:
     """Warn where free runs (S, n, n_y) leave the range of the training outputs far behind."""
     known = np.concatenate([one.outputs for one in fit.records])
     low, high = np.nanmin(known, 0), np.nanmax(known, 0)
@@ -92,7 +92,7 @@ def warn_of_divergence(fit: Fitted, record: Record, runs: np.ndarray, kind: str)
         warnings.warn(
             f"{kind}: {left.any(1).mean():.0%} of the free runs leave the range of the training "
             f"outputs by more than {FAR:g} times its width, first at sample {first} (time "
-            f"{record.time[first]:.6g}). What follows is no prediction.",
+            f"{record.record.time[first]:.6g}). What follows is no prediction.",
             stacklevel=5,
         )
 
@@ -101,14 +101,14 @@ def predict(
     fit: Fitted, record: Record, horizon: int = 1, samples: int = 200, seed: int = 0
 ) -> Prediction:
     """See `Fit.predict`."""
-    record = one_record(fit, record)
+    along = prepared(fit, record)
     if not isinstance(horizon, int | np.integer) or horizon < 1:
         raise invalid("horizon", expected="a whole number >= 1", got=repr(horizon))
-    if not record.n_outputs:
+    if not along.has_outputs:
         raise invalid("record", expected="outputs to predict from", got="none")
-    y = record.tensors().observations
+    y = along.observations
     with torch.no_grad():
-        outputs = output_process(beginning(fit, record, predicting=True), fit.scaling, record)
+        outputs = output_process(beginning(fit, along, predicting=True), along)
         found = outputs.ahead(y, int(horizon))
         mean, variance = flat(found.mean), flat(found.variance)
         noise = flat((outputs.scale * outputs.noise_sd).square())

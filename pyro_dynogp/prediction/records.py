@@ -8,51 +8,53 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.records import one_record
+from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
     from pyro_dynogp.inference.fitted import Fitted
 
 
-def one_record(fit: Fitted, record: Record) -> Record:
-    """A record prepared with the channels of the model.
+def prepared(fit: Fitted, record: Record) -> PreparedRecord:
+    """A record as the model sees it.
 
     Raises:
         ValueError: where it is no single record, or does not fit the model.
     """
-    if not isinstance(record, Record):
-        raise invalid(
-            "record",
-            expected="one Record",
-            got=type(record).__name__,
-            advice="Predict several records one after the other.",
-        )
-    return fit.model.check(record)[0]
+    single = one_record(record, "Predict several records one after the other.")
+    return fit.model.prepare(single)[0]
 
 
-def following(fit: Fitted, past: Record, future: Record) -> tuple[Record, Record]:
+def following(
+    fit: Fitted, past: Record, future: Record
+) -> tuple[PreparedRecord, PreparedRecord, float]:
     """Two records prepared together: a channel may reach back into the first, or ahead.
 
     Inputs of the future are given; a clock that is late takes those of the past from there.
 
+    Returns:
+        Both, and the time between them.
+
     Raises:
-        ValueError: as `one_record` and `gap_between`.
+        ValueError: as `prepared` and `gap_between`.
     """
     gap = gap_between(past, future)
-    alone = one_record(fit, past), one_record(fit, future)
+    before, after = prepared(fit, past), prepared(fit, future)
     if not fit.model.channels or set(future.input_names) != set(past.input_names):
-        return alone
-    if alone[0].input_names == past.input_names:  # prepared before they were split
-        return alone
+        return before, after, gap
+    if before.record.input_names == past.input_names:  # prepared before they were split
+        return before, after, gap
     first, second = (
-        one.with_outputs(np.zeros((len(one), 0)), names=(), units=()) for one in (past, future)
+        part.with_outputs(np.zeros((len(part), 0)), names=(), units=()) for part in (past, future)
     )
     both = joined(first, second, future.time[0] - past.time[-1] - gap)
     inputs = np.split(fit.model.check(both)[0].inputs, [len(past)])
     before, after = (
-        dataclasses.replace(one, inputs=u) for one, u in zip(alone, inputs, strict=True)
+        PreparedRecord.of(dataclasses.replace(part.record, inputs=u), part.scaling)
+        for part, u in zip((before, after), inputs, strict=True)
     )
-    return before, after
+    return before, after, gap
 
 
 def joined(first: Record, second: Record, shift: float = 0.0) -> Record:

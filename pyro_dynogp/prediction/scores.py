@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.prediction.mixture_score import mixture_crps
+from pyro_dynogp.prediction.mixture_score import mixture_scores
 from pyro_dynogp.prediction.prediction import Prediction
 from pyro_dynogp.support.errors import invalid
 
@@ -26,7 +26,7 @@ def scores(prediction: Prediction, record: Record, skip: int = 0) -> dict[str, A
         - ``rmse``, ``mae`` [output]: of the predictive mean.
         - ``nrmse``: rmse over the standard deviation of the measured output.
         - ``fit_percent``: 100 (1 - nrmse), the fit index of system identification [%].
-        - ``crps`` [output]: continuous ranked probability score, exact for the normal mixture
+        - ``crps`` [output]: continuous ranked probability score of the normal mixture
           (`pyro_dynogp.prediction.mixture_score`).
         - ``negative_log_density`` [nats per sample]: of each sample by itself.
         - ``coverage_50``, ``coverage_95``: share of samples within the central intervals.
@@ -53,8 +53,6 @@ def scores(prediction: Prediction, record: Record, skip: int = 0) -> dict[str, A
     if not 0 <= skip < len(record):
         raise invalid("skip", expected=f"a number from 0 to {len(record) - 1}", got=repr(skip))
     y = record.outputs
-    low50, high50, low95, high95 = prediction.quantile([0.25, 0.75, 0.025, 0.975])
-    density = prediction.log_density(y)
     columns: dict[str, list[float]] = {}
     for a in range(y.shape[1]):
         there = np.isfinite(y[:, a])
@@ -68,10 +66,10 @@ def scores(prediction: Prediction, record: Record, skip: int = 0) -> dict[str, A
         spread = float(target.std())
         rmse = float(np.sqrt(np.mean(error**2)))
         nrmse = rmse / spread if spread > 0 else float("nan")
-        crps = mixture_crps(
-            target,
-            prediction.component_mean[:, there, a],
-            prediction.component_sd[:, there, a],
+        found = mixture_scores(
+            y[:, a],
+            prediction.component_mean[:, :, a],
+            prediction.component_sd[:, :, a],
             prediction.component_weights,
         )
         values = {
@@ -79,10 +77,10 @@ def scores(prediction: Prediction, record: Record, skip: int = 0) -> dict[str, A
             "mae": float(np.mean(np.abs(error))),
             "nrmse": nrmse,
             "fit_percent": 100.0 * (1.0 - nrmse),
-            "crps": float(crps.mean()),
-            "negative_log_density": -float(np.mean(density[there, a])),
-            "coverage_50": _inside(target, low50[there, a], high50[there, a]),
-            "coverage_95": _inside(target, low95[there, a], high95[there, a]),
+            "crps": float(found.crps[there].mean()),
+            "negative_log_density": -float(np.mean(found.log_density[there])),
+            "coverage_50": _central(found.level[there], 0.5),
+            "coverage_95": _central(found.level[there], 0.95),
             "count": int(there.sum()),
         }
         for name, value in values.items():
@@ -92,5 +90,6 @@ def scores(prediction: Prediction, record: Record, skip: int = 0) -> dict[str, A
     return {name: np.asarray(values) for name, values in columns.items()}
 
 
-def _inside(y: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
-    return float(np.mean((y >= low) & (y <= high)))
+def _central(level: np.ndarray, share: float) -> float:
+    """Share of samples whose level (n,) lies in the central interval of this probability."""
+    return float(np.mean(np.abs(level - 0.5) <= 0.5 * share))

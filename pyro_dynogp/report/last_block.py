@@ -14,7 +14,6 @@ from pyro_dynogp.discrepancy.decision import Confirmed
 from pyro_dynogp.discrepancy.parameters import parameters_of
 from pyro_dynogp.discrepancy.result import FoundEffect
 from pyro_dynogp.discrepancy.search import Found
-from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
 from pyro_dynogp.discrepancy.state import SearchState
 from pyro_dynogp.discrepancy.trials import one_step_density
 from pyro_dynogp.effects.base import Effect, experiment
@@ -23,6 +22,7 @@ from pyro_dynogp.prediction.records import joined
 from pyro_dynogp.prediction.scores import scores
 from pyro_dynogp.report.report import Report
 from pyro_dynogp.statistics.evidence import Residuals
+from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.support.parallel import parallel_map
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def does_not_pay(
     after: Mapping[str, float],
     gain: float,
     error: float,
-    settings: LoopSettings = DEFAULTS,
+    settings: LoopSettings,
 ) -> list[str]:
     """A warning where forecasts of the last block are worse by both scores, or clearly less likely.
 
@@ -131,8 +131,9 @@ def _tested(
 
     def smallest(task: tuple[Effect, list[Residuals]]) -> float:
         effect, parts = task
-        p = [e.p_value for one in parts for e in effect.detect(one, seed=rounds.seed)]
-        return min(p, default=1.0)  # nothing left to test
+        found = [effect.detect(part, rounds.settings, seed=rounds.seed) for part in parts]
+        # There may be nothing left to test.
+        return min((one.p_value for several in found for one in several), default=1.0)
 
     tasks = [(effect, parts) for effect in effects for parts in residuals]
     p = parallel_map(

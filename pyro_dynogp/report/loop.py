@@ -10,7 +10,6 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.blocks import blocks_of
 from pyro_dynogp.discrepancy.context import SearchContext, Stopwatch
 from pyro_dynogp.discrepancy.refits import poles_of, quick_fit
-from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
 from pyro_dynogp.discrepancy.state import SearchState
 from pyro_dynogp.discrepancy.trials import without
 from pyro_dynogp.effects import CATALOGUE, Effect
@@ -21,6 +20,7 @@ from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.variants import used_channels
 from pyro_dynogp.report.last_block import report_of
 from pyro_dynogp.report.report import Report
+from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.parallel import one_thread, parallel_map
 
@@ -42,7 +42,7 @@ def close_loop(
     level: float = 0.05,
     tries: int = 8,
     effects: Sequence[Effect] = CATALOGUE,
-    settings: LoopSettings = DEFAULTS,
+    settings: LoopSettings | None = None,
     workers: int | None = None,
     progress: bool = True,
 ) -> Report:
@@ -71,7 +71,7 @@ def close_loop(
         seed: the same seed gives the same report. max_rounds: most effects that are added.
         level: of the tests. tries: most effects that are refitted in a round.
         effects: what is looked for, `CATALOGUE` and your own.
-        settings: every other threshold.
+        settings: every other threshold; None for the defaults of `LoopSettings`.
         workers: processes; None for all processors, or the cluster of
             ``joblib.parallel_config``. progress: whether to show progress bars.
 
@@ -82,6 +82,7 @@ def close_loop(
         raise invalid("max_rounds", expected="a whole number >= 1", got=repr(max_rounds))
     if not 0.0 < level < 1.0:
         raise invalid("level", expected="a number between 0 and 1", got=repr(level))
+    settings = LoopSettings() if settings is None else settings
     watch = Stopwatch()
     other = candidates if isinstance(candidates, Record) else None
     data = blocks_of(fit, record, other, settings)

@@ -47,9 +47,9 @@ def interactions(residuals: Residuals) -> list[np.ndarray]:
     lag = _correlation_time(r.mean) * r.step
 
     def block(signal: np.ndarray) -> np.ndarray:
-        one = signal[:, None]
-        slow = filtered(one, r.step, r.time, np.array([-1.0 / lag]), lags=0)[:, 0]
-        ways = [] if path is None else [path(int(j), one) for j in leading[:2]]
+        column = signal[:, None]
+        slow = filtered(column, r.step, r.time, np.array([-1.0 / lag]), lags=0)[:, 0]
+        ways = [] if path is None else [path(int(j), column) for j in leading[:2]]
         return standardised(np.column_stack([slow, *ways]))
 
     moving = [*inputs, *standardised(r.mean[:, None]).T]

@@ -5,34 +5,32 @@ from __future__ import annotations
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 
-from pyro_dynogp.statistics.autoregression import fitted_filter
+from pyro_dynogp.statistics.autoregression import check_samples, fitted_filter
+from pyro_dynogp.statistics.bootstrap import batches, tail_probability
 from pyro_dynogp.statistics.evidence import Residuals
-from pyro_dynogp.statistics.scan import tail_probability
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.statistics.settings import LoopSettings
 
-REPLICATES = 400
 # Numbers of lags that are looked at together; no more than a fifth of the samples.
 WINDOWS = (1, 2, 4, 8, 16, 32)
 
 
-def held_out_innovations(residuals: Residuals) -> np.ndarray:
+def held_out_innovations(residuals: Residuals, settings: LoopSettings) -> np.ndarray:
     """Standardised one-step errors (n,) where held out, NaN elsewhere.
 
     Raises:
-        ValueError: where fewer than 30 are known.
+        ValueError: where too few are known.
     """
-    v = np.where(residuals.held_out, residuals.innovations, np.nan)
-    v = np.where(np.isfinite(v), v, np.nan)
-    count = int(np.isfinite(v).sum())
-    if count < 30:
-        raise invalid("residuals", expected="at least 30 held-out innovations", got=str(count))
+    v = np.where(
+        residuals.held_out & np.isfinite(residuals.innovations), residuals.innovations, np.nan
+    )
+    check_samples(int(np.isfinite(v).sum()), settings, "held-out innovations")
     return v
 
 
-def one_step_sd(residuals: Residuals) -> float:
+def one_step_sd(residuals: Residuals, settings: LoopSettings) -> float:
     """Standard deviation of what an autoregression leaves of the residual [output]."""
     x = residuals.residual
-    return float(np.nanstd(fitted_filter(x)(x)))
+    return float(np.nanstd(fitted_filter(x, settings)(x)))
 
 
 def autocorrelation(x: np.ndarray, lags: int) -> tuple[np.ndarray, np.ndarray]:
@@ -40,22 +38,22 @@ def autocorrelation(x: np.ndarray, lags: int) -> tuple[np.ndarray, np.ndarray]:
 
     The mean is removed; pairs (lags,) is the number of pairs that both are there.
     """
-    there = np.isfinite(x[0])
-    y = np.where(there, x - np.nanmean(x, axis=1, keepdims=True), 0.0)
+    measured = np.isfinite(x[0])
+    y = np.where(measured, x - np.nanmean(x, axis=1, keepdims=True), 0.0)
     length = next_fast_len(x.shape[1] + lags, real=True)
     products = irfft(np.abs(rfft(y, length)) ** 2, length)[:, : lags + 1]
-    pairs = np.round(irfft(np.abs(rfft(there.astype(float), length)) ** 2, length))[: lags + 1]
+    pairs = np.round(irfft(np.abs(rfft(measured.astype(float), length)) ** 2, length))[: lags + 1]
     variance = np.maximum(products[:, :1] / pairs[0], 1e-300)
     return (products[:, 1:] / np.maximum(pairs[1:], 1.0)) / variance, pairs[1:]
 
 
 def portmanteau(
-    x: np.ndarray, seed: int, signs: bool = False
+    x: np.ndarray, settings: LoopSettings, seed: int, signs: bool = False
 ) -> tuple[float, float, int, np.ndarray]:
     """Test whether a series (n,), NaN where missing, has any autocorrelation.
 
     Args:
-        x: the series. seed: of the null.
+        x: the series. settings: thresholds. seed: of the null.
         signs: null by random signs in place of random order: the sizes stay where they are, so
             that noise whose size changes does not look autocorrelated.
 
@@ -68,7 +66,7 @@ def portmanteau(
     """
     known = np.flatnonzero(np.isfinite(x))
     windows = np.array([m for m in WINDOWS if m <= max(len(known) // 5, 1)])
-    generator = np.random.default_rng(seed)
+    centred = x - np.nanmean(x)
 
     def largest(series: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         r, pairs = autocorrelation(series, int(windows[-1]))
@@ -76,18 +74,15 @@ def portmanteau(
         z = (sums - windows) / np.sqrt(2.0 * windows)
         return z.max(1), z.argmax(1), r
 
-    null = []
-    centred = x - np.nanmean(x)
-    # In batches: memory grows with the record.
-    for _ in range(8):
-        shuffled = np.full((REPLICATES // 8, len(x)), np.nan)
+    def drawn(generator: np.random.Generator, size: int) -> np.ndarray:
+        made = np.full((size, len(x)), np.nan)
         if signs:
-            shuffled[:, known] = generator.choice([-1.0, 1.0], (len(shuffled), len(known)))
-            shuffled *= centred
+            made[:, known] = centred[known] * generator.choice([-1.0, 1.0], (size, len(known)))
         else:
-            order = generator.permuted(np.tile(known, (len(shuffled), 1)), axis=1)
-            shuffled[:, known] = x[order]
-        null.append(largest(shuffled)[0])
+            made[:, known] = x[generator.permuted(np.tile(known, (size, 1)), axis=1)]
+        return made
+
+    null = np.concatenate([largest(made)[0] for made in batches(drawn, settings.replicates, seed)])
     z, best, r = largest(x[None])
-    p_value = tail_probability(np.concatenate(null), float(z[0]))
+    p_value = tail_probability(null, float(z[0]), settings)
     return float(z[0]), p_value, int(windows[best[0]]), r[0]

@@ -106,7 +106,7 @@ def looked_at(residuals: Residuals) -> int:
     return int((residuals.held_out & np.isfinite(residuals.output)).sum())
 
 
-def own(residuals: Residuals) -> np.ndarray:
+def input_columns(residuals: Residuals) -> np.ndarray:
     """The mean and responses of the inputs, (n, 1 + n_u K): what no other effect may claim.
 
     No more than about an eighth of as many columns as samples are looked at.
@@ -122,3 +122,8 @@ def own(residuals: Residuals) -> np.ndarray:
         lags=1 if each >= 4 else 0,
     )
     return np.column_stack([with_past(residuals.mean), bank])
+
+
+def linear_responses(residuals: Residuals, path: Paths) -> np.ndarray:
+    """What is linear in the inputs, with the model's own dynamics and with others."""
+    return np.column_stack([input_columns(residuals), with_past(standardised(path.shares))])

@@ -35,6 +35,8 @@ def accepted(**options: object) -> bool:
 # references would cost more than the arithmetic of one sample. The option is numba's own, so it is
 # left out where numba no longer has it: the results are the same, the recursions slower.
 BORROWING = {**OPTIONS, "_nrt": False} if accepted(_nrt=False) else dict(OPTIONS)
+# Such leaves when they become part of their caller: handing over many arrays costs more than a row.
+WITHIN = {**BORROWING, "forceinline": True}
 # The same where an array is returned; the caller's own options rule then.
 INLINED = {**OPTIONS, "inline": "always"}
 

@@ -19,6 +19,7 @@ from tests.benchmarks import (
     criticism,
     electricity,
     example2,
+    fits,
     guides,
     loop_cost,
     measured,
@@ -34,6 +35,7 @@ from tests.benchmarks.paper import run as paper
 
 PARTS = {
     "speed": speed.run,
+    "fits": fits.run,
     "example2": example2.run,
     "wiener": wiener.run,
     "cascade_cost": cascade_cost.run,

@@ -20,14 +20,16 @@ from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.left_out import monte_carlo_error
 from pyro_dynogp.criticism.posterior_draws import draws_of
 from pyro_dynogp.criticism.subjects import FitSubject, observed_of
+from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.optima import posterior_of
+from pyro_dynogp.inference.methods.svi import Schedule
 from pyro_dynogp.inference.optimise.maximum import Optimum
 from pyro_dynogp.inference.refit import optima_of, refit
+from pyro_dynogp.inference.run import Run
 from pyro_dynogp.models.architectures import Cascade
 from pyro_dynogp.models.assembly import assemble
 from pyro_dynogp.moments import filtering, smoothing
 from pyro_dynogp.moments.problem import each
-from pyro_dynogp.support.checkpoints import NOTHING_KEPT
 from tests.conftest import simulate_record
 
 QUIET: dict[str, Any] = {"workers": 1, "progress": False}
@@ -86,16 +88,11 @@ def at_the_optimum(fit: Any, record: dgp.Record) -> Any:
     """Inducing values and first states fitted to another record; all else where it was."""
     optima = [Optimum(0.0, dict(values), np.zeros(1), "") for values in optima_of(fit)]
     found = posterior_of(
-        fit.model.collapsed,
-        record,
+        Problem(fit.model, fit.model.prepare(record)),
         optima,
         "map",
-        steps=60,
-        particles=8,
-        learning_rate=0.02,
-        seed=fit.seed,
-        checkpoints=NOTHING_KEPT,
-        **QUIET,
+        Run(fit.seed, **QUIET),
+        Schedule(60),
     )
     return replace(fit, records=(record,), posterior=found.guide, mode=found.mode)
 

@@ -24,6 +24,7 @@ from scipy import stats
 import pyro_dynogp as dgp
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.optimise.maximum import maximise
+from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.poles import starting_values
 from pyro_dynogp.support.parallel import child_seeds, parallel_map, seeded
 
@@ -80,10 +81,11 @@ def one_replicate(task: _Task) -> dict[str, int]:
         y = trace.nodes["y"]["value"].numpy()
         record = dgp.Record(time=blank.time, inputs=blank.inputs, outputs=y)
         # Coordinates from the data alone, not from the truth: the kernel must not know it.
-        start = starting_values(model, (record,), count=1, seed=task.seed)
-        optimum = maximise(model, record, start, steps=60, seed=task.seed, workers=1)[0]
-        potential = Potential(model, (record,), truth)
-        centre, root = potential.laplace(optimum.values, widest=3.0)
+        records = model.prepare(record)
+        start = starting_values(model, records, count=1, seed=task.seed)
+        optimum = maximise(model, records, start, Run(task.seed, workers=1), steps=60)[0]
+        potential = Potential(model, (records,), truth)
+        centre, root = potential.laplace(optimum.values)
         middle, scale = torch.as_tensor(centre), torch.as_tensor(root)
 
         def energy(parameters: dict[str, torch.Tensor]) -> torch.Tensor:

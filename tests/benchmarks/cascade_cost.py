@@ -57,14 +57,13 @@ def values_of(model: Cascade, data: dgp.Record) -> dict[str, torch.Tensor]:
     """Moderate values of all parameters."""
     from pyro_dynogp.inference.starts.plans import Plan, starting_point
 
-    assert model.scaling is not None
-    return starting_point(model, (data,), model.scaling, Plan(None, None, False, 0))
+    return starting_point(model, model.prepare(data), Plan(None, None, False, 0))
 
 
 def collapsed_step(model: Cascade, data: dgp.Record) -> Callable[[], object]:
     """Value and gradient of the collapsed log joint: one step of MAP, no particles needed."""
     target = model.scaled_to(data).collapsed
-    potential = Potential(target, (data,), values_of(target, data))
+    potential = Potential(target, (target.prepare(data),), values_of(target, data))
     z = potential.pack(potential.at).numpy()
     return lambda: potential.value_and_gradient(z)
 
@@ -77,7 +76,8 @@ def sampled_step(model: Cascade, data: dgp.Record) -> Callable[[], object]:
         num_particles=PARTICLES, vectorize_particles=True, max_plate_nesting=0
     )
     svi = SVI(target, guide.single_pass(), ClippedAdam({"lr": 1e-4}), loss)
-    return lambda: svi.step(data)
+    records = target.prepare(data)
+    return lambda: svi.step(records)
 
 
 def seconds(call: Callable[[], object], repeats: int = 3) -> float:

@@ -116,7 +116,8 @@ def test_one_step_densities_of_a_cascade_add_up(likelihood, bent):
         torch.manual_seed(2)
         system = model.collapsed.sample_system(model.scaling)
         states = model.sample_states("")
-    observed = output_process(model.begin(system, states), model.scaling, bent)
+    (along,) = model.prepare(bent)
+    observed = output_process(model.begin(system, states), along)
     y = bent.tensors().outputs[:, 0]
     y[5:9] = torch.nan
     total = np.nansum(pointwise_log_density(observed, y, "forecast"))

@@ -177,7 +177,7 @@ def test_forecasts_with_refits_against_fits_to_the_past(linear, short):
     assert found["not_refitted"] == 0
     assert 1 < found["refits"] < 15
     compared = 0
-    for i in (30, 35, 45, 50, 55):
+    for i in (30, 35, 38, 41, 45, 48, 50, 55):
         other = subject.without(np.arange(60) >= i)
         density = other.pointwise("forecast")[:, i]
         weights, k = arviz_bridge.psis(other.draws.log_ratio)[:2]
@@ -283,6 +283,29 @@ def test_what_is_refused(linear, short):
         dgp.loo(replace(linear, records=()), target="missing sample", **QUIET)
     with pytest.raises(ValueError, match="without refits for a model of your own"):
         dgp.loo(NormalMean().subject, target="new record", **QUIET)
+
+
+def test_draws_are_moved_on_to_more_data(linear):
+    """Beside a fit to these data: what both say of the samples to come, and of parameters."""
+    subject = FitSubject(linear, linear.records, 600, 0)
+    past = subject.without(np.arange(60) >= 25)
+    assert past.carries
+    moved, fresh = (one(np.arange(60) >= 50) for one in (past.carried, subject.without))
+    assert moved.draws.kind == "annealed from draws given other data"
+    assert len(moved.fit.records[0]) == 50
+    assert set(moved.draws.ancestor) < set(range(600))
+    weights = [np.exp(arviz_bridge.psis(one.draws.log_ratio)[0]) for one in (moved, fresh)]
+    ahead = [np.log(w @ np.exp(one.pointwise("forecast")[:, 50:]))
+             for w, one in zip(weights, (moved, fresh), strict=True)]  # fmt: skip
+    # Monte Carlo errors of 600 draws, weighted or moved, on either side.
+    np.testing.assert_allclose(ahead[0], ahead[1], atol=0.15)
+    early = np.log(np.exp(past.pointwise("forecast")[:, 50:]).mean(0))
+    assert np.abs(early - ahead[1]).max() > 1.0  # what the move has changed
+    for name in ("noise_sd", "g_log_decay", "g_log_frequency"):
+        draws = [one.draws.values[name].log() if name == "noise_sd" else one.draws.values[name]
+                 for one in (moved, fresh)]  # fmt: skip
+        first, second = (w @ x.numpy() for w, x in zip(weights, draws, strict=True))
+        np.testing.assert_allclose(first, second, atol=0.35 * float(draws[1].std(0).max()))
 
 
 def test_draws_where_a_normal_will_not_do(short):

@@ -1,6 +1,6 @@
 """Simulation-based calibration of fits: a small run, what it draws, what fails, what is refused."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ import torch
 import pyro_dynogp as dgp
 from pyro_dynogp.criticism import simulation_based
 from pyro_dynogp.criticism.posterior_draws import PosteriorDraws
-from pyro_dynogp.criticism.simulation_based import _Fixed, _simulated, _Task
+from pyro_dynogp.criticism.simulation_based import _method, _simulated, _Task
 from pyro_dynogp.fitting import Fit
 from pyro_dynogp.inference.posteriors import Sampled
 
@@ -53,28 +53,30 @@ def test_the_scaling_and_with_it_the_prior_stays(model, blank, monkeypatch):
     """Records far from unit scale: a fit that learnt its scaling anew would have another prior."""
     seen = []
 
-    def fit(model, record, **options):
-        seen.append((model.scaled_to(record).scaling, record, options))
+    def fit(problem, method, run):
+        seen.append((problem, method, run))
         raise RuntimeError("seen")
 
     monkeypatch.setattr(simulation_based, "train_model", fit)
     with pytest.raises(ValueError, match="replicates that all failed, the first with: RuntimeErr"):
         run(model, blank)
-    assert [scaling == model.scaling for scaling, _, _ in seen] == [True] * 3
-    records = [record for _, record, _ in seen]
+    for problem, _, _ in seen:
+        assert problem.model.scaling == problem.scaling == model.scaling
+    records = [problem.records[0].record for problem, _, _ in seen]
     assert np.isnan(records[0].outputs[5, 0])
     assert np.isnan(records[0].outputs).sum() == 1
     assert records[0].output_names == ("level",)
     assert not np.array_equal(records[0].outputs[0], records[1].outputs[0])
-    assert [options["method"] for _, _, options in seen] == ["map"] * 3
-    assert len({options["seed"] for _, _, options in seen}) == 3
+    assert [method for _, method, _ in seen] == [dgp.Mode()] * 3
+    assert len({run.seed for _, _, run in seen}) == 3
+    assert {run.restarts for _, _, run in seen} == {1}
 
 
 def test_failures_are_counted_not_drawn_again(model, blank, monkeypatch):
     real, calls = simulation_based._fitted, []
 
     def sometimes(task, record):
-        calls.append(task.seed)
+        calls.append(task.run.seed)
         if len(calls) == 2:
             raise ValueError("covariance not\npositive definite")
         return real(task, record)
@@ -111,12 +113,12 @@ def test_an_overconfident_posterior_is_rejected(model, blank, monkeypatch, width
 
 def test_outputs_of_a_cascade_come_from_its_trajectories(blank):
     wiener = dgp.Wiener(1, pairs=1, inducing=4).scaled_to(blank)
-    fixed = _Fixed(**{f.name: getattr(wiener, f.name) for f in fields(wiener)})
     blind = blank.with_outputs(np.empty((24, 0)), names=(), units=())
-    truth, record = _simulated(_Task(fixed, blind, blank.missing, "svi", 19, 3, {}))
+    method, run, learnt = _method(wiener, "svi", 19, {})
+    task = _Task(wiener, blind, blank.missing, method, 19, replace(run, seed=3), learnt)
+    truth, record = _simulated(task)
     assert {"g", "f", "f_values", "g_initial_state"} <= set(truth)
     assert record.outputs.shape == (24, 1)
-    assert fixed.collapsed.scaled_to(record).scaling == wiener.scaling
 
 
 def test_what_is_refused(model, blank):

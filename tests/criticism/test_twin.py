@@ -25,7 +25,7 @@ def exact(model, argument, values, *, chains, draws, **options):
     """The posterior in place of NUTS's chains: Laplace's draws, resampled by their ratios."""
     del options
     potential = Potential(model, (argument,), values)
-    centre, root = potential.laplace(values, widest=1.5)
+    centre, root = potential.laplace(values)
     guide = Mixture.normal(potential, torch.as_tensor(centre), torch.as_tensor(root))
     generator = torch.Generator().manual_seed(0)
     z = torch.randn(4000, len(centre), generator=generator, dtype=torch.float64)

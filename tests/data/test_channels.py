@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import pickle
-from dataclasses import dataclass, field
 
 import numpy as np
 import pandas as pd
@@ -80,30 +78,6 @@ def test_a_prepared_record_stays_as_it_is() -> None:
     chain = [channels.Delayed("valve", 0.5), channels.Play("valve delayed", 0.4), ALL[6]]
     once = channels.prepared(record(), chain)
     assert channels.prepared(once, chain) is once
-
-
-@dataclass(frozen=True)
-class Scaled(channels.Recorded):
-    """A user's channel; a list has no hash."""
-
-    factors: list[float] = field(default_factory=lambda: [1.0])
-
-    def columns(self, record: dgp.Record) -> np.ndarray:
-        return self.factors[0] * super().columns(record)
-
-
-def test_a_record_is_prepared_once_for_the_same_channels() -> None:
-    own, late = record(), [channels.Delayed("valve", d) for d in (0.5, 1.0)]
-    made = [channels.prepared(own, [one]) for one in late]
-    assert all(channels.prepared(own, (one,)) is x for one, x in zip(late, made, strict=True))
-    assert channels.prepared(record(), [late[0]]) is not made[0]
-    for factor in (2.0, 3.0):
-        column = channels.prepared(own, [Scaled("ambient", factors=[factor])]).inputs[:, 2]
-        np.testing.assert_allclose(column, factor * own.extra["ambient"])
-    for step in range(10):  # the last few are kept
-        channels.prepared(own, [channels.Step(float(step))])
-    assert channels.prepared(own, [late[0]]) is not made[0]
-    assert len(pickle.dumps(own)) == len(pickle.dumps(record()))
 
 
 def test_what_a_channel_needs_must_be_there() -> None:

@@ -6,6 +6,11 @@ from scipy.signal import lfilter
 
 from pyro_dynogp.statistics.autoregression import fitted_filter
 from pyro_dynogp.statistics.evidence import Residuals
+from pyro_dynogp.statistics.settings import LoopSettings
+
+SETTINGS = LoopSettings()
+# Fewer replicates, for many series.
+FEW = LoopSettings(replicates=19, fewest_replicates=19)
 
 
 def coloured(rng, shape, pole):
@@ -25,7 +30,7 @@ def residuals_of(
     """What a detector gets; draws of the parameters differ in the gain of the mean."""
     rng = np.random.default_rng(seed + 1000)
     e = output - mean
-    inside = fitted_filter(e)
+    inside = fitted_filter(e, SETTINGS)
     innovations = np.concatenate([np.full(inside.order, np.nan), inside(e)])
     n = len(output)
     return Residuals(

@@ -10,6 +10,7 @@ from scipy.signal import lfilter
 
 import pyro_dynogp as dgp
 from pyro_dynogp.discrepancy.data_faults import data_spikes, faults, without_stuck
+from tests.discrepancy.made import SETTINGS
 
 from .series import residuals
 
@@ -29,7 +30,7 @@ def stuck(one: dgp.Record, candidates: tuple[str, ...] = ()) -> list[int]:
 
 def test_clean_records_have_none() -> None:
     assert not any(faults(record(seed), ["wind"]) for seed in range(20))
-    assert not any(data_spikes(residuals(seed, 500)) for seed in range(20))
+    assert not any(data_spikes(residuals(seed, 500), SETTINGS) for seed in range(20))
 
 
 def test_each_is_found() -> None:
@@ -49,12 +50,12 @@ def test_spike() -> None:
     r = residuals(0, 500)
     y = r.output.copy()
     y[400] += 30.0
-    fault = data_spikes(replace(r, output=y))
+    fault = data_spikes(replace(r, output=y), SETTINGS)
     assert fault is not None
     assert list(fault.samples) == [400]
     assert "has 1 spike of one sample" in fault.sentence
     y[300] += 40.0
-    several = data_spikes(replace(r, output=y, output_unit=""))
+    several = data_spikes(replace(r, output=y, output_unit=""), SETTINGS)
     assert several is not None
     assert "has 2 spikes of one sample" in several.sentence
     assert "  " not in several.sentence

@@ -25,6 +25,8 @@ from pyro_dynogp.discrepancy.decision import (
 from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.discrepancy.trials import Tried, interleaved, stretches
 from pyro_dynogp.statistics.evidence import Evidence
+from pyro_dynogp.statistics.settings import LoopSettings
+from tests.discrepancy.made import SETTINGS
 from tests.discrepancy.test_loop import fitted, machine
 
 MODEL = dgp.LinearDynamicGP(inputs=1, pairs=1)
@@ -44,7 +46,7 @@ def helping(effect: effects.Effect, p: float, q: float, gain: float = 50.0) -> _
     kind = ("after", effect.score)
     noise = np.random.default_rng(0).normal(0.0, 0.1, n)
     found = spoken_for(effect, p, q)
-    return _judge(found, kind, tried(noise + gain / n), tried(np.zeros(n)), 1)
+    return _judge(found, kind, tried(noise + gain / n), tried(np.zeros(n)), 1, SETTINGS)
 
 
 def names(judged: list[_Judged]) -> list[str]:
@@ -103,7 +105,9 @@ def judged_noise(gains: np.ndarray, errors: np.ndarray, before: np.ndarray) -> _
     """A candidate for the noise with gains (N,), and errors of forecasts before and after."""
     found = spoken_for(effects.HeavyTails(), 1e-9, 1e-8)
     base = tried(0.0 * gains, errors=before[:, None])
-    return _judge(found, ("after", "one step"), tried(gains, errors=errors[:, None]), base, 1)
+    return _judge(
+        found, ("after", "one step"), tried(gains, errors=errors[:, None]), base, 1, SETTINGS
+    )
 
 
 def test_noise_that_costs_the_forecasts_does_not_help() -> None:
@@ -141,7 +145,7 @@ def test_gains_of_nothing_seldom_count(freedom: float) -> None:
 
 
 def test_folds_have_data_on_either_side_of_every_instant() -> None:
-    first, second = interleaved(240)
+    first, second = interleaved(240, SETTINGS.folds)
     assert not (first & second).any()
     assert not (first | second)[:20].any()  # the past of the first forecast
     assert [part.stop - part.start for part in stretches(first)] == [20] * 6
@@ -150,7 +154,7 @@ def test_folds_have_data_on_either_side_of_every_instant() -> None:
 
 def test_half_of_the_block_that_is_searched_can_be_fitted_to() -> None:
     held_out = np.arange(480) >= 240
-    some = shared(held_out)
+    some = shared(held_out, SETTINGS.stretches)
     assert some.sum() == 120
     assert some[-1]
     assert not some[:240].any()
@@ -217,7 +221,7 @@ def test_the_fit_of_the_winner_is_handed_on() -> None:
     variants = tuple(found.effect.extend(model, found.evidence, record))
     done = confirm(
         [(found, variants)], fit, record[:360], held_out,
-        number=1, seed=0, level=0.05, workers=1,
+        number=1, seed=0, level=0.05, settings=SETTINGS, workers=1,
     )  # fmt: skip
     assert done.winner is found
     assert done.fit is not None
@@ -237,7 +241,17 @@ def test_noise_is_tried_where_no_structure_is_certain(q: float, decision: str) -
     model = replace(fit.model, scaling=None)
     tasks = [(one, tuple(one.effect.extend(model, one.evidence, record))) for one in both]
     held_out = np.arange(360) >= 240
-    done = confirm(tasks, fit, record[:360], held_out, number=1, seed=0, level=0.05, workers=1)
+    done = confirm(
+        tasks,
+        fit,
+        record[:360],
+        held_out,
+        number=1,
+        seed=0,
+        level=0.05,
+        settings=SETTINGS,
+        workers=1,
+    )
     assert done.winner is both[1]
     decisions = {one.evidence.effect: one.decision for one in done.attempts}
     assert decisions == {"extra input": "accepted", "heavy tails": decision}
@@ -315,7 +329,7 @@ def test_a_calendar_moves_to_another_clock_instead_of_being_there_twice() -> Non
 
 def test_feedback_is_among_the_effects_and_changes_nothing() -> None:
     class Certain(effects.Feedback):
-        def detect(self, residuals: Any, seed: int = 0) -> list[Evidence]:
+        def detect(self, residuals: Any, settings: LoopSettings, seed: int = 0) -> list[Evidence]:
             return [spoken_for(self, 1e-9, 1e-9, channel="u").evidence]
 
     record = machine(seed=5)

@@ -17,9 +17,11 @@ from pyro_dynogp import effects
 from pyro_dynogp.data.channels import Transformed
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.models.variants import Model, with_channel
-from pyro_dynogp.statistics.detecting import evidence, lasting
+from pyro_dynogp.statistics.detecting import lasting
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
+from pyro_dynogp.statistics.pictures import evidence
 from pyro_dynogp.statistics.regression import with_past
+from pyro_dynogp.statistics.settings import LoopSettings
 
 FEW = (effects.ExtraInput(), effects.LevelShift(), effects.HeavyTails())
 N = 480
@@ -130,9 +132,11 @@ class SquaredInput(effects.Effect):
     family = "shapes"
     acts_on = "inputs"
 
-    def detect(self, residuals: Residuals, seed: int = 0) -> Sequence[Evidence]:
+    def detect(
+        self, residuals: Residuals, settings: LoopSettings, seed: int = 0
+    ) -> Sequence[Evidence]:
         u = residuals.inputs[:, 0] - residuals.inputs[:, 0].mean()
-        result = lasting(residuals, [with_past(u**2)], None, seed)
+        result = lasting(residuals, [with_past(u**2)], None, settings, seed)
         return [evidence(self.name, result, {}, "The input acts squared, too.", None)]
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:

@@ -14,7 +14,7 @@ from pyro_dynogp.discrepancy import refits
 from pyro_dynogp.discrepancy.refits import energy, quick_fit, race
 from pyro_dynogp.discrepancy.search import candidates_of
 from pyro_dynogp.models.variants import with_channel, without_process_noise
-from tests.discrepancy.made import coloured
+from tests.discrepancy.made import SETTINGS, coloured
 from tests.discrepancy.plant_dynamics import System, response
 from tests.discrepancy.test_decision import spoken_for, two_inputs
 
@@ -107,11 +107,11 @@ def test_a_variant_is_tried_for_one_channel_only():
     data, model = two_inputs(), dgp.LinearDynamicGP(inputs=2, pairs=1)
     first = spoken_for(effects.DeadTime(), 0.001, 0.01, channel="a", delay=7200.0)
     second = spoken_for(effects.DeadTime(), 0.002, 0.01, channel="b", delay=9000.0)
-    (_, some), (_, others) = candidates_of([first, second], model, data, 0.05, 8)
+    (_, some), (_, others) = candidates_of([first, second], model, data, 0.05, 8, SETTINGS)
     assert others
     assert len(others) < len(some)
     assert not {repr(one) for one in some} & {repr(one) for one in others}
-    assert len(candidates_of([first, first], model, data, 0.05, 8)) == 1
+    assert len(candidates_of([first, first], model, data, 0.05, 8, SETTINGS)) == 1
 
 
 def test_a_saturation_knows_its_limits_and_a_function_goes_on_as_a_line():

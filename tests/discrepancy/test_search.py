@@ -14,12 +14,13 @@ from pyro_dynogp import effects
 from pyro_dynogp.discrepancy.context import SearchContext
 from pyro_dynogp.discrepancy.decision import certain
 from pyro_dynogp.discrepancy.search import Found, candidates_of, look, rated
-from pyro_dynogp.discrepancy.settings import DEFAULTS, LoopSettings
 from pyro_dynogp.discrepancy.state import SearchState
 from pyro_dynogp.discrepancy.trials import without
 from pyro_dynogp.effects import Effect
 from pyro_dynogp.statistics import omnibus
 from pyro_dynogp.statistics.evidence import Evidence
+from pyro_dynogp.statistics.settings import LoopSettings
+from tests.discrepancy.made import SETTINGS
 from tests.discrepancy.test_loop import machine
 
 
@@ -35,7 +36,7 @@ class Certain(Effect):
     def __init__(self, name: str, p: float) -> None:
         self.name, self.p = name, p
 
-    def detect(self, residuals, seed=0):
+    def detect(self, residuals, settings, seed=0):
         return [Evidence(self.name, 5.0, self.p, 10.0, 0.1)]
 
     def extend(self, model, evidence, record):
@@ -59,11 +60,11 @@ def test_false_discovery_rates_hold_however_tests_depend():
 def test_every_output_is_paid_for():
     """Of two outputs there are twice as many tests: the same p-value is worth half as much."""
     residuals = SimpleNamespace()
-    one, _ = look([residuals], [Certain("a", 0.02)], seed=0, workers=1)
-    two, _ = look([residuals, residuals], [Certain("a", 0.02)], seed=0, workers=1)
+    one, _ = look([residuals], [Certain("a", 0.02)], SETTINGS, seed=0, workers=1)
+    two, _ = look([residuals, residuals], [Certain("a", 0.02)], SETTINGS, seed=0, workers=1)
     assert [f.evidence.p_value for f in one] == [0.02]
     assert [f.evidence.p_value for f in two] == [0.04, 0.04]
-    certainly, _ = look([residuals] * 3, [Certain("a", 0.5)], seed=0, workers=1)
+    certainly, _ = look([residuals] * 3, [Certain("a", 0.5)], SETTINGS, seed=0, workers=1)
     assert max(f.evidence.p_value for f in certainly) == 1.0
 
 
@@ -77,7 +78,7 @@ def test_relatives_of_a_certain_effect_are_tried_up_to_a_p_value():
         def extend(self, model, evidence, record):
             return [replace(model, layers=(replace(model.layers[0], pairs=3),))]
 
-    def tried(p: float, family: str, settings: LoopSettings = DEFAULTS) -> list[str]:
+    def tried(p: float, family: str, settings: LoopSettings = SETTINGS) -> list[str]:
         other = Other("other", p)
         other.family = family  # type: ignore[misc]
         found = [Found(*speaking(Certain("first", 1e-6), 1e-6), 1e-6),
@@ -101,9 +102,9 @@ def state():
     from pyro_dynogp.discrepancy.context import Stopwatch
     from pyro_dynogp.discrepancy.refits import quick_fit
 
-    data = blocks_of(fit, record, None)
+    data = blocks_of(fit, record, None, SETTINGS)
     looked_for = (effects.OutputNonlinearity(), effects.Saturation(), effects.LevelShift())
-    context = SearchContext(data, [], 0, 0.05, 8, looked_for, 1, False)
+    context = SearchContext(data, [], 0, 0.05, 8, looked_for, 1, False, SETTINGS)
     first = quick_fit(model, without(data.known, data.held_out), 0, fit)
     return SearchState(context, Stopwatch(), first)
 
@@ -157,12 +158,14 @@ def test_two_answers_to_whether_anything_is_left_share_the_level(state):
 
 def test_the_omnibus_test_pays_for_its_five_ways(monkeypatch):
     """Sidak's formula: one p-value of 0.01 among five is 1 - 0.99^5."""
-    monkeypatch.setattr(omnibus, "held_out_innovations", lambda r: np.zeros(50))
+    monkeypatch.setattr(omnibus, "held_out_innovations", lambda r, settings: np.zeros(50))
     monkeypatch.setattr(omnibus, "portmanteau", lambda *a, **k: (0.0, 0.5))
-    monkeypatch.setattr(omnibus, "_not_normal", lambda v, seed: 0.01)
-    monkeypatch.setattr(omnibus, "_follows", lambda r, seed: 0.7)
-    monkeypatch.setattr(omnibus, "beyond_catalogue", lambda r, seed=0: SimpleNamespace(p_value=0.9))
-    p, sentence = omnibus.structure_left(SimpleNamespace(output_name="y"))
+    monkeypatch.setattr(omnibus, "_not_normal", lambda v, settings, seed: 0.01)
+    monkeypatch.setattr(omnibus, "_follows", lambda r, settings, seed: 0.7)
+    monkeypatch.setattr(
+        omnibus, "beyond_catalogue", lambda r, settings, seed=0: SimpleNamespace(p_value=0.9)
+    )
+    p, sentence = omnibus.structure_left(SimpleNamespace(output_name="y"), SETTINGS, 0.05)
     assert p == pytest.approx(1.0 - 0.99**5)
     assert "one-step errors are not normal" in sentence
 
@@ -170,8 +173,8 @@ def test_the_omnibus_test_pays_for_its_five_ways(monkeypatch):
 @pytest.mark.parametrize(
     ("gains", "settings", "counts"),
     [
-        (np.full(100, 0.05), DEFAULTS, True),  # 5 nats, no error
-        (np.full(100, 0.035), DEFAULTS, False),  # 3.5 nats are less than 4
+        (np.full(100, 0.05), SETTINGS, True),  # 5 nats, no error
+        (np.full(100, 0.035), SETTINGS, False),  # 3.5 nats are less than 4
         (np.full(100, 0.035), LoopSettings(gain=3.0), True),
     ],
 )
@@ -183,7 +186,7 @@ def test_a_gain_has_to_be_more_than_two_standard_errors():
     rng = np.random.default_rng(0)
     gains = 0.1 + rng.standard_normal(100)
     gains += 0.12 - gains.mean()  # 12 nats; the error is about 10
-    assert not certain(gains)
+    assert not certain(gains, SETTINGS)
     assert certain(gains, LoopSettings(standard_errors=0.5))
 
 

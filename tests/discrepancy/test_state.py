@@ -18,6 +18,7 @@ from pyro_dynogp.discrepancy.state import SearchState
 from pyro_dynogp.discrepancy.trials import without
 from pyro_dynogp.models.variants import has_process_noise, without_process_noise
 from pyro_dynogp.statistics.evidence import Evidence
+from tests.discrepancy.made import SETTINGS
 
 from .series import residuals, share
 
@@ -40,9 +41,9 @@ def oscillator(late: int, noise: float, seed: int) -> dgp.Record:
 def test_process_noise_that_costs_forecasts_is_pointed_out(late, noise, hides):
     record = oscillator(late, noise, seed=1)
     fit = dgp.fit(MODEL, record[:240], restarts=2, workers=1, progress=False)
-    data = blocks_of(fit, record, None)
+    data = blocks_of(fit, record, None, SETTINGS)
     training = without(data.known, data.held_out)
-    rounds = SearchContext(data, [], 0, 0.05, 8, (effects.LevelShift(),), 1, False)
+    rounds = SearchContext(data, [], 0, 0.05, 8, (effects.LevelShift(),), 1, False, SETTINGS)
     given = quick_fit(MODEL, training, 0, fit)
     said = rounds.hiding(given, rounds.plain(given))
     assert bool(said) == hides, said
@@ -60,7 +61,9 @@ def test_a_fit_without_process_noise_hides_nothing(rounds):
 def rounds():
     record = oscillator(0, 0.0, seed=2)
     fit = dgp.fit(MODEL, record[:240], restarts=1, workers=1, progress=False)
-    return SearchContext(blocks_of(fit, record, None), [], 0, 0.05, 8, (), 1, False)
+    return SearchContext(
+        blocks_of(fit, record, None, SETTINGS), [], 0, 0.05, 8, (), 1, False, SETTINGS
+    )
 
 
 def test_what_is_left_is_said(rounds):

@@ -11,17 +11,18 @@ import pyro_dynogp as dgp
 from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.data.channels import Recorded
 from pyro_dynogp.discrepancy.refits import quick_fit
-from pyro_dynogp.discrepancy.settings import DEFAULTS
 from pyro_dynogp.discrepancy.trials import held_out_density
 from pyro_dynogp.inference.methods import mode as cascade_fit
+from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.mode import grow, starting_points
 from pyro_dynogp.inference.optimise.maximum import maximise
+from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.poles import grown
 from pyro_dynogp.models.variants import with_channel, with_pairs, without_process_noise
-from pyro_dynogp.support.checkpoints import NOTHING_KEPT
-from tests.discrepancy.made import coloured
+from tests.discrepancy.made import SETTINGS, coloured
 from tests.discrepancy.plant_dynamics import System, response
 
+ALONE = Run(workers=1)
 NOISE, N, TRAINING = 0.05, 320, 220
 
 
@@ -48,7 +49,7 @@ def base(record):
 
 
 def log_likelihood(model, records, values):
-    trace = pyro.poutine.trace(pyro.poutine.condition(model, data=values)).get_trace(*records)
+    trace = pyro.poutine.trace(pyro.poutine.condition(model, data=values)).get_trace(records)
     trace.compute_log_prob()
     return float(trace.nodes["y"]["log_prob_sum"])
 
@@ -57,11 +58,11 @@ def log_likelihood(model, records, values):
 def test_what_has_grown_starts_at_the_likelihood_of_its_base(record, base, more):
     plain = replace(base.model, scaling=None)
     extended = with_channel(plain, Recorded("w")) if more == "channel" else with_pairs(plain, 1)
-    records = extended.check(record[:TRAINING])
-    target = extended.scaled_to(records).collapsed
-    (start,) = starting_points(target, records, 1, 5, 0, 1, False, NOTHING_KEPT)
+    problem = Problem.of(extended, record[:TRAINING])
+    target, records = problem.target, problem.records
+    (start,) = starting_points(target, records, ALONE, count=1, steps=5)
     sites = target.all_sites(target.scaling, 1)
-    before = log_likelihood(base.model.collapsed, base.model.check(record[:TRAINING]), base.mode)
+    before = log_likelihood(base.model.collapsed, base.model.prepare(record[:TRAINING]), base.mode)
     after = log_likelihood(target, records, grown(base.mode, start, sites))
     loud = log_likelihood(target, records, grown(base.mode, start))
     # A new pair has a little process noise already.
@@ -77,7 +78,7 @@ def test_an_extended_cascade_explains_what_its_base_lacks(record, base):
     gain = held_out_density(fit, record, fold, "forecast")
     gain = gain - held_out_density(base, record, fold, "forecast")
     # What the loop asks of an effect.
-    assert gain.sum() > max(DEFAULTS.gain, DEFAULTS.standard_errors * block_standard_error(gain)[0])
+    assert gain.sum() > max(SETTINGS.gain, SETTINGS.standard_errors * block_standard_error(gain)[0])
     error = fit.forecast(training, record[TRAINING:]).mean - record.outputs[TRAINING:]
     # 100 samples; the bend and both responses are known to some 10 % of the noise each.
     assert np.sqrt(np.mean(error**2)) < 1.3 * NOISE
@@ -91,17 +92,17 @@ def test_the_same_model_goes_on_from_where_it_is(record, base):
 def test_growing_climbs_without_process_noise_too(monkeypatch, record, base):
     calls = []
 
-    def recorded(model, records, starts, **options):
-        found = maximise(model, records, starts, **options)
+    def recorded(model, records, starts, run, **options):
+        found = maximise(model, records, starts, run, **options)
         calls.append((model, starts[0], found[0]))
         return found
 
     monkeypatch.setattr(cascade_fit, "maximise", recorded)
-    records = base.model.check(record[:TRAINING])
+    records = base.model.prepare(record[:TRAINING])
     target = base.model.collapsed
-    (start,) = starting_points(target, records, 1, 5, 0, 1, False, NOTHING_KEPT)
+    (start,) = starting_points(target, records, ALONE, count=1, steps=5)
     calls.clear()
-    found = grow(target, records[0], base.mode, start, steps=5, seed=0)
+    found = grow(target, records, base.mode, start, ALONE, steps=5)
     (quiet, loud, without), (_, first, one), (_, second, other) = calls
     assert not quiet.layers[0].process_noise
     assert float(loud["noise_sd"]) >= 0.5
@@ -112,7 +113,7 @@ def test_growing_climbs_without_process_noise_too(monkeypatch, record, base):
     # Where there is no such noise one climb is enough.
     calls.clear()
     silent = without_process_noise(base.model).collapsed
-    grow(silent, records[0], base.mode, start, steps=2, seed=0)
+    grow(silent, records, base.mode, start, ALONE, steps=2)
     assert len(calls) == 1
 
 

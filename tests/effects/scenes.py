@@ -29,8 +29,8 @@ def two_paths(seed, noise=0.1):
     return u, lag(u[:, 0], 0.5), lag(u[:, 1], 0.8), noise * coloured(rng, 500, 0.7)
 
 
-def first_extra(residuals, seed=0):
-    return extra_input(residuals, seed=seed)[0]
+def first_extra(residuals, settings, seed=0):
+    return extra_input(residuals, settings, seed=seed)[0]
 
 
 def with_noise(r, x):
@@ -62,9 +62,9 @@ def stamps(n, freq="h"):
     return pd.date_range("2023-03-18", periods=n, freq=freq, tz="UTC")
 
 
-def of_the_week(residuals, **options):
+def of_the_week(residuals, settings, **options):
     """The calendar's first piece of evidence, in place of a detector of one."""
-    return calendar(residuals, **options)[0]
+    return calendar(residuals, settings, **options)[0]
 
 
 def trend(t, mean, u):

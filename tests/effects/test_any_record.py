@@ -21,7 +21,7 @@ from pyro_dynogp.effects.output_nonlinearity import output_nonlinearity
 from pyro_dynogp.effects.periodic import periodic_disturbance
 from pyro_dynogp.effects.process_noise import process_noise
 from pyro_dynogp.effects.saturation import saturation
-from tests.discrepancy.made import coloured, lag, residuals_of
+from tests.discrepancy.made import FEW, SETTINGS, coloured, lag, residuals_of
 from tests.discrepancy.series import in_other_units, residuals
 from tests.effects.scenes import (
     first_extra,
@@ -57,10 +57,12 @@ def test_units_and_the_order_of_channels_do_not_matter_of_paths():
         candidates={"w": 0.01 * w + 1.0},
     )
     for detector in (first_extra, dead_time, unmodelled_dynamics):
-        a, b = detector(one), detector(other)
+        a, b = detector(one, SETTINGS), detector(other, SETTINGS)
         assert a.p_value == pytest.approx(b.p_value, rel=1e-3, abs=0.003)
         assert 1.8 * a.size == pytest.approx(b.size, rel=1e-3)
-    assert 60 * dead_time(one).where["delay"] == pytest.approx(dead_time(other).where["delay"])
+    assert 60 * dead_time(one, SETTINGS).where["delay"] == pytest.approx(
+        dead_time(other, SETTINGS).where["delay"]
+    )
 
 
 @pytest.mark.parametrize("detector", DETECTORS)
@@ -77,7 +79,7 @@ def test_units_and_the_order_of_channels_do_not_matter_of_shapes(detector):
         inputs=1e3 * one.inputs[:, ::-1] - 4.0,
         input_names=("v", "u"),
     )
-    a, b = detector(one), detector(other)
+    a, b = detector(one, SETTINGS), detector(other, SETTINGS)
     assert a.p_value == pytest.approx(b.p_value, rel=1e-3, abs=0.003)
     assert 1.8 * a.size == pytest.approx(b.size, rel=1e-3)
     assert a.where.get("channel") == b.where.get("channel")
@@ -86,7 +88,7 @@ def test_units_and_the_order_of_channels_do_not_matter_of_shapes(detector):
 @pytest.mark.parametrize("detector", [heavy_tails, heteroscedastic_noise, process_noise, feedback])
 def test_units_and_order_do_not_matter_of_noise(detector):
     r = growing_with_input(0)
-    one, other = detector(r), detector(in_other_units(r))
+    one, other = detector(r, SETTINGS), detector(in_other_units(r), SETTINGS)
     one, other = (one, other[::-1]) if isinstance(one, list) else ([one], [other])
     for a, b in zip(one, other, strict=True):
         assert b.p_value == pytest.approx(a.p_value, rel=1e-6)
@@ -98,13 +100,12 @@ def test_units_and_order_do_not_matter_of_noise(detector):
             )
 
 
-@pytest.mark.usefixtures("few")
 @pytest.mark.parametrize(
     "detector", [drift, level_shift, periodic_disturbance, of_the_week, clock_shift]
 )
 def test_units_and_order_do_not_matter_of_time(detector):
     r = residuals(0, 400, inputs=2, step=1.0, stamps=stamps(400), deviation=0.02, effect=gain_drift)
-    one, other = detector(r), detector(in_other_units(r))
+    one, other = detector(r, FEW), detector(in_other_units(r), FEW)
     assert other.p_value == pytest.approx(one.p_value, rel=1e-6)
     assert other.size == pytest.approx(1e-3 * one.size, rel=1e-6)
     for key, value in one.where.items():
@@ -125,31 +126,29 @@ def test_gaps_and_irregular_steps(detector):
     r = residuals_of(a + b + e, a + b, u, time=time)
     y = r.output.copy()
     y[200:230] = np.nan
-    found = detector(dataclasses.replace(r, output=y))
+    found = detector(dataclasses.replace(r, output=y), SETTINGS)
     assert 0.0 < found.p_value <= 1.0
     assert np.isfinite(found.statistic)
     assert found.sentence.endswith(".")
 
 
-@pytest.mark.usefixtures("few")
 @pytest.mark.parametrize("detector", [drift, level_shift, of_the_week, clock_shift])
 def test_irregular_steps_and_gaps(detector):
     generator = np.random.default_rng(0)
     r = residuals(0, 400, step=1.0, stamps=stamps(400))
     output = np.where(generator.random(400) < 0.1, np.nan, r.output)
     time = r.time + 0.3 * generator.random(400)
-    found = detector(dataclasses.replace(r, output=output, time=time))
+    found = detector(dataclasses.replace(r, output=output, time=time), FEW)
     assert 0.0 < found.p_value <= 1.0
     assert np.isfinite(found.gain)
 
 
-@pytest.mark.usefixtures("few")
 @pytest.mark.parametrize("detector", [drift, level_shift, periodic_disturbance, of_the_week])
 def test_records_without_inputs_and_without_noise(detector):
     r = residuals(0, 400, step=1.0, stamps=stamps(400))
     free = dataclasses.replace(r, inputs=r.inputs[:, :0], input_names=(), mean=np.zeros(400))
-    assert detector(free).p_value > 0.0
-    assert detector(dataclasses.replace(r, output=r.mean.copy())).p_value > 0.05
+    assert detector(free, FEW).p_value > 0.0
+    assert detector(dataclasses.replace(r, output=r.mean.copy()), FEW).p_value > 0.05
 
 
 def test_too_few_samples_are_refused():
@@ -157,4 +156,4 @@ def test_too_few_samples_are_refused():
     few = dataclasses.replace(r, held_out=np.arange(300) < 20)
     for detector in (heavy_tails, heteroscedastic_noise, process_noise, feedback):
         with pytest.raises(ValueError, match="30"):
-            detector(few)
+            detector(few, SETTINGS)

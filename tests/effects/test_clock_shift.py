@@ -13,7 +13,7 @@ from pyro_dynogp.discrepancy.refits import quick_fit
 from pyro_dynogp.discrepancy.trials import Trial, run
 from pyro_dynogp.effects.clock_shift import clock_shift, seasons
 from pyro_dynogp.models.variants import with_channel
-from tests.discrepancy.made import coloured
+from tests.discrepancy.made import SETTINGS, coloured
 from tests.discrepancy.plant_dynamics import System, response
 from tests.discrepancy.series import residuals, share
 from tests.discrepancy.test_decision import spoken_for
@@ -30,14 +30,14 @@ class TestClockShift:
             own = share(u[:, channel], channel + 1.0)
             return np.where(t >= 90.0, np.interp(t + shift, t, own) - own, 0.0)
 
-        found = clock_shift(residuals(3, 400, inputs=2, effect=effect))
+        found = clock_shift(residuals(3, 400, inputs=2, effect=effect), SETTINGS)
         assert found.p_value < 1e-4
         assert found.where["channel"] == f"u{channel + 1}"
         assert found.where["shift"] == pytest.approx(shift, abs=0.2)
         assert found.where["time"] == pytest.approx(90.0, abs=4.0)
 
     def test_daylight_saving_is_found(self):
-        found = clock_shift(daylight_saving(1), zones=("Europe/Berlin", MELBOURNE))
+        found = clock_shift(daylight_saving(1), SETTINGS, zones=("Europe/Berlin", MELBOURNE))
         assert found.p_value < 1e-4
         assert found.where == {
             "channel": "hour", "rule": MELBOURNE, "season": "summers", "shift": 1.0, "time": 352.0,
@@ -53,7 +53,7 @@ class TestClockShift:
 
         r = residuals(3, 1200, step=0.5, effect=effect)
         r = dataclasses.replace(r, stamps=stamps(1200, "30min"))
-        found = clock_shift(r, zones=(MELBOURNE,))
+        found = clock_shift(r, SETTINGS, zones=(MELBOURNE,))
         assert found.p_value < 1e-4
         assert (found.where["rule"], found.where["season"]) == (MELBOURNE, "winters")
         assert found.where["shift"] == pytest.approx(0.5 * shift)
@@ -64,13 +64,13 @@ class TestClockShift:
             return np.interp(t - STEP, t, mean) - mean
 
         STEP = 0.5
-        found = clock_shift(residuals(0, 400, effect=late))
+        found = clock_shift(residuals(0, 400, effect=late), SETTINGS)
         assert found.p_value > 0.01
 
     def test_there_must_be_an_input(self):
         r = residuals(0)
         with pytest.raises(ValueError, match="an input"):
-            clock_shift(dataclasses.replace(r, inputs=r.inputs[:, :0], input_names=()))
+            clock_shift(dataclasses.replace(r, inputs=r.inputs[:, :0], input_names=()), SETTINGS)
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +113,7 @@ def test_instant_and_shift_are_refined(record, instant, shift):
     found = spoken_for(effect, 0.001, 0.01, **where)
     variants = tuple(effect.extend(MODEL, found.evidence, record))
     held_out = np.arange(N) >= 400
-    trial = Trial(variants, record, (held_out,), base, 0, "forecast", effect.refine)
+    trial = Trial(variants, record, (held_out,), base, 0, SETTINGS, "forecast", effect.refine)
     tried = run(trial)
     (channel,) = tried.model.channels
     assert channel.shift == LATE * STEP

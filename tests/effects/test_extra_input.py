@@ -6,7 +6,7 @@ import pytest
 from pyro_dynogp.data import signals
 from pyro_dynogp.effects.dynamics import unmodelled_dynamics
 from pyro_dynogp.effects.extra_input import extra_input
-from tests.discrepancy.made import coloured, lag, residuals_of
+from tests.discrepancy.made import SETTINGS, coloured, lag, residuals_of
 from tests.effects.scenes import first_extra, step_inputs
 
 N = 400
@@ -29,7 +29,7 @@ def test_a_missing_channel_is_found_with_its_form(form, function):
     w = lag(w[0], 0.5) * 3.0
     y = parts.sum(1) + e + lag(function(w, u), 0.3)
     r = residuals_of(y, parts.sum(1), u, {"ambient": 20.0 + 3.0 * w, "other": other})
-    found, none = extra_input(r)
+    found, none = extra_input(r, SETTINGS)
     assert found.p_value < 1e-4
     assert found.where == {"channel": "ambient", "form": form, "delay": 0.0}
     assert none.p_value > 0.01
@@ -41,7 +41,7 @@ def test_the_delay_of_a_missing_channel():
     rng, u, parts, e = step_inputs(2)
     w = coloured(rng, N, 0.7)
     y = parts.sum(1) + e + 0.8 * lag(signals.delayed(w, TIME, 1.25), 0.3)
-    found = first_extra(residuals_of(y, parts.sum(1), u, {"w": w}))
+    found = first_extra(residuals_of(y, parts.sum(1), u, {"w": w}), SETTINGS)
     assert found.p_value < 1e-4
     assert found.where["delay"] == pytest.approx(1.25, abs=0.1)
 
@@ -52,8 +52,8 @@ def test_what_used_inputs_explain_is_not_ascribed_to_a_candidate():
     y = parts.sum(1) + e + lag(u[:, 0], 2.0, gain=1.5)
     w = u[:, 0] + 0.3 * coloured(rng, N, 0.5)
     r = residuals_of(y, parts.sum(1), u, {"w": w})
-    assert unmodelled_dynamics(r).p_value < 1e-3
-    assert first_extra(r).p_value > 0.05
+    assert unmodelled_dynamics(r, SETTINGS).p_value < 1e-3
+    assert first_extra(r, SETTINGS).p_value > 0.05
 
 
 def test_a_candidate_with_gaps_and_no_candidates():
@@ -61,5 +61,5 @@ def test_a_candidate_with_gaps_and_no_candidates():
     w = coloured(rng, N, 0.8)
     y = parts.sum(1) + e + lag(w, 0.3)
     w[rng.random(N) < 0.05] = np.nan
-    assert first_extra(residuals_of(y, parts.sum(1), u, {"w": w})).p_value < 1e-4
-    assert extra_input(residuals_of(y, parts.sum(1), u)) == []
+    assert first_extra(residuals_of(y, parts.sum(1), u, {"w": w}), SETTINGS).p_value < 1e-4
+    assert extra_input(residuals_of(y, parts.sum(1), u), SETTINGS) == []

@@ -3,21 +3,24 @@
 import numpy as np
 
 from pyro_dynogp.effects.heteroscedastic import heteroscedastic_noise
+from tests.discrepancy.made import SETTINGS
 from tests.discrepancy.series import residuals
 from tests.effects.scenes import growing_with_input, with_noise
 
 
 class TestHeteroscedasticNoise:
     def test_driver_is_named(self):
-        found = [heteroscedastic_noise(growing_with_input(s), seed=s) for s in range(3)]
+        found = [heteroscedastic_noise(growing_with_input(s), SETTINGS, seed=s) for s in range(3)]
         assert all(e.p_value < 1e-4 and e.where["driver"] == "u2" for e in found)
 
     def test_time_is_named(self):
         r = residuals(0, 500, pole=0.0)
-        found = heteroscedastic_noise(with_noise(r, r.residual * np.linspace(0.5, 2.0, 500)))
+        found = heteroscedastic_noise(
+            with_noise(r, r.residual * np.linspace(0.5, 2.0, 500)), SETTINGS
+        )
         assert found.p_value < 1e-4
         assert found.where["driver"] == "time"
 
     def test_heavy_tails_are_no_driver(self):
         series = (residuals(s, draw=lambda g, m: g.standard_t(4.0, m)) for s in range(5))
-        assert np.median([heteroscedastic_noise(r).p_value for r in series]) > 0.05
+        assert np.median([heteroscedastic_noise(r, SETTINGS).p_value for r in series]) > 0.05

@@ -6,7 +6,7 @@ import pytest
 from pyro_dynogp.data import signals
 from pyro_dynogp.effects.dead_time import dead_time
 from pyro_dynogp.effects.hysteresis import hysteresis
-from tests.discrepancy.made import lag, residuals_of
+from tests.discrepancy.made import SETTINGS, lag, residuals_of
 from tests.effects.scenes import two_paths
 
 N = 500
@@ -16,7 +16,7 @@ STEP = 0.1
 def test_play_at_an_input():
     u, a, b, e = two_paths(8, noise=0.05)
     r = residuals_of(a + lag(signals.play(u[:, 1], 0.8), 0.8) + e, a + b, u)
-    found = hysteresis(r)
+    found = hysteresis(r, SETTINGS)
     assert found.p_value < 1e-3
     assert found.where["channel"] == "v"
     assert found.where["width"] == pytest.approx(0.8, rel=0.2)
@@ -24,7 +24,7 @@ def test_play_at_an_input():
 
 def test_play_at_the_output():
     u, a, b, e = two_paths(9, noise=0.05)
-    found = hysteresis(residuals_of(signals.play(a + b, 0.5) + e, a + b, u))
+    found = hysteresis(residuals_of(signals.play(a + b, 0.5) + e, a + b, u), SETTINGS)
     assert found.p_value < 1e-6
     assert found.where["channel"] == "speed"
     assert found.where["width"] == pytest.approx(0.5, rel=0.1)
@@ -35,5 +35,5 @@ def test_a_phase_lag_is_not_play():
     late = residuals_of(
         lag(signals.delayed(u[:, 0], STEP * np.arange(N), 0.2), 0.5) + b + e, a + b, u
     )
-    assert dead_time(late).p_value < 1e-6
-    assert hysteresis(late).p_value > 0.01
+    assert dead_time(late, SETTINGS).p_value < 1e-6
+    assert hysteresis(late, SETTINGS).p_value > 0.01

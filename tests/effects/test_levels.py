@@ -20,8 +20,7 @@ from pyro_dynogp.effects.output_nonlinearity import output_nonlinearity
 from pyro_dynogp.effects.periodic import periodic_disturbance
 from pyro_dynogp.effects.process_noise import process_noise
 from pyro_dynogp.effects.saturation import saturation
-from pyro_dynogp.statistics import bootstrap as sieve
-from tests.discrepancy.made import null_record, within_chance
+from tests.discrepancy.made import FEW, SETTINGS, null_record, within_chance
 from tests.discrepancy.series import check_rate, residuals
 from tests.effects.scenes import first_extra, of_the_week, stamps
 
@@ -30,14 +29,14 @@ DETECTORS = [output_nonlinearity, input_nonlinearity, saturation, dead_zone, hys
 
 @pytest.mark.parametrize("detector", [first_extra, dead_time, unmodelled_dynamics])
 def test_level_of_paths(detector):
-    p = np.array([detector(null_record(seed, 240)).p_value for seed in range(100)])
+    p = np.array([detector(null_record(seed, 240), SETTINGS).p_value for seed in range(100)])
     assert within_chance((p <= 0.05).sum(), 100, 0.05)
     assert within_chance((p <= 0.3).sum(), 100, 0.3)
 
 
 @pytest.mark.parametrize("detector", DETECTORS)
 def test_level_of_shapes(detector):
-    p = np.array([detector(null_record(seed, 240)).p_value for seed in range(100)])
+    p = np.array([detector(null_record(seed, 240), SETTINGS).p_value for seed in range(100)])
     assert within_chance((p <= 0.05).sum(), 100, 0.05)
     assert within_chance((p <= 0.3).sum(), 100, 0.3)
 
@@ -46,32 +45,31 @@ class TestNoise:
     def test_level_is_kept_by_tails_and_process_noise(self):
         series = [residuals(s) for s in range(100)]
         for detector in (heavy_tails, process_noise):
-            check_rate([detector(r, seed=s).p_value for s, r in enumerate(series)])
+            check_rate([detector(r, SETTINGS, seed=s).p_value for s, r in enumerate(series)])
 
-    def test_level_is_kept_by_sizes(self, monkeypatch):
-        monkeypatch.setattr(sieve, "REPLICATES", 19)
-        monkeypatch.setattr(sieve, "FEWEST", 19)
-        check_rate([heteroscedastic_noise(residuals(s, 150), seed=s).p_value for s in range(100)])
+    def test_level_is_kept_by_sizes(self):
+        check_rate(
+            [heteroscedastic_noise(residuals(s, 150), FEW, seed=s).p_value for s in range(100)]
+        )
 
     def test_level_is_kept_by_feedback(self):
         series = (residuals(s, deviation=0.02) for s in range(100))
-        check_rate([feedback(r, seed=s)[0].p_value for s, r in enumerate(series)])
+        check_rate([feedback(r, SETTINGS, seed=s)[0].p_value for s, r in enumerate(series)])
 
 
-@pytest.mark.usefixtures("few")
 class TestTime:
     @pytest.mark.parametrize("detector", [drift, level_shift, periodic_disturbance, clock_shift])
     def test_level_is_kept(self, detector):
         check_rate(
-            [detector(residuals(s, 150, deviation=0.02), seed=s).p_value for s in range(100)]
+            [detector(residuals(s, 150, deviation=0.02), FEW, seed=s).p_value for s in range(100)]
         )
 
     def test_level_is_kept_for_the_calendar(self):
         clock = stamps(160, "3h")
         series = (residuals(s, 160, step=1.0, stamps=clock) for s in range(100))
-        check_rate([of_the_week(r, seed=s).p_value for s, r in enumerate(series)])
+        check_rate([of_the_week(r, FEW, seed=s).p_value for s, r in enumerate(series)])
 
     def test_level_is_kept_for_the_year(self):
         clock = pd.date_range("2020-01-01", periods=600, freq="D", tz="UTC")
         series = (residuals(s, 600, step=1.0, stamps=clock) for s in range(60))
-        check_rate([calendar(r, seed=s)[1].p_value for s, r in enumerate(series)])
+        check_rate([calendar(r, FEW, seed=s)[1].p_value for s, r in enumerate(series)])

@@ -11,7 +11,7 @@ from pyro_dynogp.data.channels import Sinusoid
 from pyro_dynogp.discrepancy.refits import quick_fit
 from pyro_dynogp.discrepancy.trials import Trial, run
 from pyro_dynogp.effects.periodic import periodic_disturbance
-from tests.discrepancy.made import coloured
+from tests.discrepancy.made import SETTINGS, coloured
 from tests.discrepancy.plant_dynamics import System, response
 from tests.discrepancy.series import residuals
 from tests.discrepancy.test_decision import spoken_for
@@ -30,13 +30,16 @@ class TestPeriodicDisturbance:
             angle = 2.0 * np.pi * t / 11.83
             return size * (np.sin(angle) + 0.4 * np.sin(2.0 * angle + 1.0))
 
-        found = periodic_disturbance(residuals(7, 750, pole=0.0, effect=line))
+        found = periodic_disturbance(residuals(7, 750, pole=0.0, effect=line), SETTINGS)
         assert found.p_value < 1e-9
         assert found.gain > 0.3 * 375 * np.log(1.0 + 0.58 * size**2)
         assert found.where["period"] == pytest.approx(11.83, rel=2e-3)
 
     def test_period_is_found(self):
-        found = [periodic_disturbance(residuals(s, 500, effect=sine), seed=s) for s in range(2, 6)]
+        found = [
+            periodic_disturbance(residuals(s, 500, effect=sine), SETTINGS, seed=s)
+            for s in range(2, 6)
+        ]
         assert np.median([e.p_value for e in found]) < 0.01
         # Half of 1 / duration at this period is 0.35 s.
         assert np.median([abs(e.where["period"] - 13.3) for e in found]) < 0.15
@@ -46,7 +49,7 @@ class TestPeriodicDisturbance:
         def saw(t, mean, u):
             return 3.0 * ((t / 16.7) % 1.0)
 
-        found = periodic_disturbance(residuals(0, 600, pole=0.0, effect=saw))
+        found = periodic_disturbance(residuals(0, 600, pole=0.0, effect=saw), SETTINGS)
         assert found.p_value < 1e-6
         assert found.where["period"] == pytest.approx(16.7, rel=0.005)
         assert "harmonics 2" in found.sentence
@@ -56,7 +59,7 @@ class TestPeriodicDisturbance:
             return 3.0 * np.sin(t) * (t < 100.0)
 
         held = np.arange(500) >= 200
-        found = periodic_disturbance(residuals(0, 500, effect=early, held_out=held))
+        found = periodic_disturbance(residuals(0, 500, effect=early, held_out=held), SETTINGS)
         assert found.p_value > 0.01
 
     def test_rows_that_are_not_there(self):
@@ -70,10 +73,10 @@ class TestPeriodicDisturbance:
             },
             deviations=r.deviations[:, kept],
         )
-        assert periodic_disturbance(fewer).where["period"] == pytest.approx(13.3, abs=0.2)
+        assert periodic_disturbance(fewer, SETTINGS).where["period"] == pytest.approx(13.3, abs=0.2)
         crooked = dataclasses.replace(fewer, time=fewer.time**1.01)
         with pytest.raises(ValueError, match="equal steps"):
-            periodic_disturbance(crooked)
+            periodic_disturbance(crooked, SETTINGS)
 
 
 @pytest.mark.parametrize(("shown", "off"), [(1, 0.0), (1, 0.12), (2, 0.03), (3, -0.02)])
@@ -93,7 +96,11 @@ def test_the_period_is_that_of_the_fundamental(shown: int, off: float) -> None:
     found = spoken_for(effect, 0.001, 0.01, period=seen, output="y", time_unit="s")
     variants = tuple(effect.extend(MODEL, found.evidence, training))
     base = quick_fit(MODEL, training, 0)
-    tried = run(Trial(variants, record, (np.arange(N) >= 300,), base, 0, "forecast", effect.refine))
+    tried = run(
+        Trial(
+            variants, record, (np.arange(N) >= 300,), base, 0, SETTINGS, "forecast", effect.refine
+        )
+    )
     (channel,) = tried.model.channels
     assert isinstance(channel, Sinusoid)
     assert abs(channel.period - PERIOD) < 0.05 * PERIOD**2 / training.duration

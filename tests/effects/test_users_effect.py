@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import textwrap
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,7 @@ import pyro_dynogp as dgp
 from pyro_dynogp import effects
 from pyro_dynogp.effects.base import OUTSIDE, experiment
 
-HERE = Path(__file__).parent
-FILE = (HERE / "users_effect.py").read_text()
-PAGE = (HERE.parents[1] / "docs" / "effects.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs" / "effects.md").read_text()
 N, STEP, TRUTH = 480, 0.5, 90.0
 
 
@@ -35,16 +33,21 @@ def blocks() -> list[str]:
     return [part.partition("```")[0] for part in PAGE.split("```python\n")[1:]]
 
 
-def test_the_page_and_the_docstring_show_the_file() -> None:
-    assert len(FILE.splitlines()) <= 60
-    assert blocks()[0] == FILE
-    assert textwrap.indent(FILE, "    ").replace('"""', "'''") in (effects.__doc__ or "")
+@pytest.fixture
+def users_effect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page's file, where Python finds it."""
+    (tmp_path / "users_effect.py").write_text(blocks()[0])
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "users_effect", raising=False)
 
 
-def test_the_loop_names_it_adds_it_and_says_how_long_it_lasts(
-    record: dgp.Record, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.syspath_prepend(HERE)
+def test_the_file_is_short_and_the_package_names_the_page() -> None:
+    assert len(blocks()[0].splitlines()) <= 61
+    assert "docs/effects.md" in (effects.__doc__ or "")
+
+
+@pytest.mark.usefixtures("users_effect")
+def test_the_loop_names_it_adds_it_and_says_how_long_it_lasts(record: dgp.Record) -> None:
     model = dgp.LinearDynamicGP(1, pairs=1, process_noise=False)
     fit = dgp.fit(model, record[:240], restarts=2, workers=1, progress=False)
     names: dict[str, Any] = {"dgp": dgp, "fit": fit, "record": record}
@@ -60,8 +63,8 @@ def test_the_loop_names_it_adds_it_and_says_how_long_it_lasts(
     assert report.after["rmse"] < 0.5 * report.before["rmse"]
 
 
-def test_its_experiment_is_found_from_either_side(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(HERE)
+@pytest.mark.usefixtures("users_effect")
+def test_its_experiment_is_found_from_either_side() -> None:
     from users_effect import Ageing  # type: ignore[import-not-found]
 
     known = (*effects.CATALOGUE, Ageing())

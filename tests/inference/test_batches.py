@@ -9,6 +9,7 @@ import pyro_dynogp as dgp
 from pyro_dynogp.data.channels import Trend
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.optimise.maximum import Effort, maximise
+from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.poles import starting_values
 from tests.conftest import simulate_record
 
@@ -89,10 +90,10 @@ def test_other_models_are_evaluated_point_by_point():
 @pytest.mark.parametrize("optimizer", ["lbfgs", "preconditioned", "adam"])
 def test_starts_end_together_where_they_end_alone(optimizer):
     model = Linear(1, pairs=2).scaled_to(ONE)
-    starts = starting_values(model, (ONE,), count=3, seed=0)
-    options = {"optimizer": optimizer, "steps": 20, "workers": 1}
-    alone = maximise(model, ONE, starts, effort=Effort(1.0, together=1), **options)
-    both = maximise(model, ONE, starts, effort=Effort(1.0, together=3), **options)
+    starts = starting_values(model, model.prepare(ONE), count=3, seed=0)
+    options = {"optimizer": optimizer, "steps": 20}
+    alone = maximise(model, ONE, starts, Run(workers=1), effort=Effort(1.0, together=1), **options)
+    both = maximise(model, ONE, starts, Run(workers=1), effort=Effort(1.0, together=3), **options)
     for one, other in zip(alone, both, strict=True):
         assert other.energy == pytest.approx(one.energy, abs=1e-4)
         # Later ones went through differences of gradients, which enlarge rounding.

@@ -33,7 +33,7 @@ MODELS = {
 def potentials(name, seed=0):
     """The plain potential, the straight one, and an unconstrained vector near a start."""
     model = MODELS[name].scaled_to(RECORD)
-    values = starting_point(model, (RECORD,), model.scaling, Plan(None, None, False, 0))
+    values = starting_point(model, model.prepare(RECORD), Plan(None, None, False, 0))
     target = model.collapsed
     plain = Potential(target, (RECORD,), values)
     generator = torch.Generator().manual_seed(seed)
@@ -128,7 +128,7 @@ def test_curvature_is_nearly_that_at_the_mode():
     stiffest = []
     for kind in (Potential, StraightPotential):
         potential = kind(model.collapsed, (data,), fit.mode)
-        centre, root = potential.laplace(fit.mode, widest=3.0)
+        centre, root = potential.laplace(fit.mode)
         rng = np.random.default_rng(0)
         found = []
         for _ in range(2):
@@ -137,3 +137,34 @@ def test_curvature_is_nearly_that_at_the_mode():
         stiffest.append(max(found))
     assert stiffest[1] < 10.0
     assert stiffest[0] > 10.0 * stiffest[1]
+
+
+def test_noise_gains_and_their_scale_are_straight_around_a_mode():
+    """Draws of a normal there weigh alike; in plain coordinates next to none has any weight."""
+    modes = dgp.Modes(
+        [-0.5 + 2.0j, -0.2 + 0.7j], [[1.0 + 0.3j], [0.3 - 0.5j]], [1.0, 0.6 + 0.2j],
+        [[0.2 + 0.1j], [0.1 + 0.05j]],
+    )  # fmt: skip
+    data = simulate_record(modes, 0.1, n=200, seed=1)
+    model = dgp.LinearDynamicGP(inputs=1, pairs=2)
+    fit = dgp.fit(model, data, restarts=2, workers=1, progress=False)
+    spread = []
+    for kind in (Potential, StraightPotential):
+        potential = kind(fit.model.collapsed, (data,), fit.mode)
+        centre, root = map(torch.as_tensor, potential.laplace(fit.mode))
+        generator = torch.Generator().manual_seed(0)
+        x = torch.randn(300, len(centre), generator=generator, dtype=torch.float64)
+        with torch.no_grad():
+            energy = potential.energy(centre + x @ root.mT, jacobian=True)
+        log_ratio = 0.5 * x.square().sum(-1) - energy
+        spread.append(float(log_ratio.quantile(0.9) - log_ratio.quantile(0.1)))
+    assert 0.0 < spread[1] < 15.0
+    assert spread[0] > 5.0 * spread[1]
+    # A bijection, and its Jacobian.
+    z = potential.pack(fit.mode) + 0.3
+    back = potential.unpack(z)
+    torch.testing.assert_close(potential.pack(back), z)
+    J = torch.autograd.functional.jacobian(lambda x: potential._unconstrained(x)[0], z)
+    log_det = potential._unconstrained(z)[1]
+    torch.testing.assert_close(torch.linalg.slogdet(J).logabsdet, log_det)
+    assert abs(float(log_det)) > 0.1

@@ -202,9 +202,8 @@ class TestElbo:
         """A guide whose pseudo-observations are the data themselves; the rest conditioned."""
         scaling = dgp.Scaling.from_records(record)
         model = model.scaled_to(record)
-        values = starting_values(
-            dgp.LinearDynamicGP(inputs=1, pairs=1, scaling=scaling), [record], count=1, seed=0
-        )[0]
+        linear = dgp.LinearDynamicGP(inputs=1, pairs=1, scaling=scaling)
+        values = starting_values(linear, linear.prepare(record), count=1, seed=0)[0]
         values["offset"] = torch.tensor([0.2], dtype=torch.float64)
         y = (record.outputs[:, 0] - scaling.output_offset[0]) / scaling.output_scale[0]
         family = dgp.GaussMarkov(init_mean=y - 0.2, init_sd=float(values["noise_sd"][0]))
@@ -270,9 +269,8 @@ class TestStarts:
         layer = model.wires[0].layer
         twin = linear_twin(model, layer, model.scaling)
         optimum = dgp.fit(twin, bent, restarts=1, workers=1, progress=False)
-        start = starting_point(
-            model, (bent,), model.scaling, Plan("g", dict(optimum.mode), False, 0)
-        )
+        plan = Plan("g", dict(optimum.mode), False, 0)
+        start = starting_point(model, model.prepare(bent), plan)
         condition = pyro.poutine.condition(model.collapsed, data=start)
         with torch.no_grad():
             trace = pyro.poutine.trace(condition).get_trace(bent)

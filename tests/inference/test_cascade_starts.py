@@ -64,8 +64,8 @@ def test_without_process_noise():
 def test_starts_climb_without_process_noise_first(monkeypatch, bent):
     calls = []
 
-    def recorded(model, records, starts, **options):
-        found = maximise(model, records, starts, **options)
+    def recorded(model, records, starts, run, **options):
+        found = maximise(model, records, starts, run, **options)
         calls.append((model, list(starts), options["key"], found))
         return found
 

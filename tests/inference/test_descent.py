@@ -94,6 +94,6 @@ def test_hessian_by_differences(seed, d):
 
 def test_bounded_root_of_a_definite_hessian_is_that_of_its_inverse():
     H, _, _ = quadratic(3, 5, 4.0)
-    root = bounded_root(H, widest=1e3)
+    root = bounded_root(H)
     np.testing.assert_allclose(root @ root.T, np.linalg.inv(H), rtol=1e-9)
     np.testing.assert_array_equal(root, np.tril(root))

@@ -198,7 +198,10 @@ def test_nuts_one_pair_of_300_samples(one_pair):
     ("options", "message"),
     [
         ({"method": "mcmc"}, "method: expected 'map', 'svi' or 'nuts'"),
-        ({"optimizer": "sgd"}, "optimizer: expected 'lbfgs', 'preconditioned' or 'adam'"),
+        (
+            {"optimizer": "sgd"},
+            "optimizer: expected 'gauss-newton', 'lbfgs', 'preconditioned' or 'adam'",
+        ),
         ({"restarts": 0}, "restarts: expected a whole number >= 1"),
         ({"chains": 0, "method": "nuts"}, "chains"),
         ({"workers": 0}, "workers"),

@@ -11,6 +11,8 @@ from scipy.stats import multivariate_normal
 
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.methods.normal import AS_GOOD, CLOSE, log_weights, variational
+from pyro_dynogp.inference.methods.svi import Schedule
+from pyro_dynogp.inference.run import Run
 
 X = torch.tensor([[1.0, 0.5], [-0.3, 2.0], [0.7, 0.7]], dtype=torch.float64)
 Y = torch.tensor([0.4, -1.1, 0.9], dtype=torch.float64)
@@ -36,7 +38,9 @@ def evidence():
 
 
 def test_where_the_posterior_is_normal_nothing_is_trained():
-    found = variational(normal, (Y,), {"w": torch.zeros(2, dtype=torch.float64)}, steps=50)
+    found = variational(
+        normal, (Y,), {"w": torch.zeros(2, dtype=torch.float64)}, Run(), Schedule(50)
+    )
     assert found.message == AS_GOOD
     assert found.elbo == pytest.approx([evidence()], abs=1e-4)
     precision = torch.eye(2, dtype=torch.float64) + X.T @ X / NOISE**2
@@ -49,11 +53,11 @@ def test_where_the_posterior_is_normal_nothing_is_trained():
 
 def test_where_it_is_not_svi_raises_the_elbo():
     start = {"sd": torch.ones((), dtype=torch.float64)}
-    found = variational(skewed, (Y,), start, steps=300, particles=32)
+    found = variational(skewed, (Y,), start, Run(), Schedule(300, 32))
     assert found.message != AS_GOOD
     assert len(found.elbo) > 50
     potential = Potential(skewed, (Y,), start)
-    centre, root = (torch.as_tensor(x) for x in potential.laplace(start, widest=2.0))
+    centre, root = (torch.as_tensor(x) for x in potential.laplace(start))
     many = torch.cat([log_weights(potential, centre, root, seed) for seed in range(40)])
     assert 0.5 * many.var() > CLOSE
     assert found.elbo[-50:].mean() > many.mean()
@@ -62,7 +66,7 @@ def test_where_it_is_not_svi_raises_the_elbo():
 def test_log_weights_are_the_divergence_of_a_wrong_normal():
     """Of a normal that is too wide by known factors: KL in closed form, and half the variance."""
     potential = Potential(normal, (Y,), {"w": torch.zeros(2, dtype=torch.float64)})
-    centre, root = potential.laplace({"w": torch.zeros(2, dtype=torch.float64)}, widest=2.0)
+    centre, root = potential.laplace({"w": torch.zeros(2, dtype=torch.float64)})
     wide = torch.as_tensor(root) * 1.1
     many = torch.cat([
         log_weights(potential, torch.as_tensor(centre), wide, seed) for seed in range(60)

@@ -1,6 +1,7 @@
 """A posterior around several optima: weights, draws, density."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pyro
@@ -19,7 +20,7 @@ from tests.inference.cascades import FAST, wiener
 
 @pytest.fixture(scope="module")
 def several(bent):
-    options = {**FAST, "restarts": 6, "steps": 60, "draws": 400}
+    options = {**FAST, "restarts": 8, "steps": 60, "draws": 400}
     return dgp.fit(wiener(), bent, **options)
 
 
@@ -53,12 +54,13 @@ def test_a_needle_does_not_lead_because_it_is_high():
         optima.append(Optimum(energy, values, np.zeros(1), ""))
     optima.sort(key=lambda one: one.energy)
     assert float(optima[0].values["x"]) == -2.0  # the needle is the highest
-    leading, weights = _weighted(hills, None, optima, Run(workers=1))
+    problem = SimpleNamespace(target=hills, records=None)
+    leading, weights = _weighted(problem, optima, Run(workers=1))
     tempered = (shares ** (1.0 / spread(optima[0].values))).sort(descending=True).values
     kept = tempered[tempered / tempered.sum() >= LEAST_WEIGHT]
     assert [float(values["x"]) for values in leading] == [0.0, 2.0]
     assert weights.numpy() == pytest.approx((kept / kept.sum()).numpy(), abs=0.01)
-    alone, one = _weighted(hills, None, optima[:1], Run(workers=1))
+    alone, one = _weighted(problem, optima[:1], Run(workers=1))
     assert (len(alone), one.tolist()) == (1, [1.0])
 
 

@@ -35,10 +35,26 @@ def test_steps_are_those_between_the_samples():
     assert grid.steps.tolist() == [0.5, 2.0]  # distinct ones, none of them zero
 
 
-def test_nearly_equal_steps_are_kept_apart():
-    t = np.array([0.0, 0.1, np.nextafter(0.2, 1.0)])
+def test_steps_that_differ_by_rounding_are_one():
+    for t in (0.05 * np.arange(5000), np.linspace(0.0, 7.3, 4000), 1.7e9 + 0.01 * np.arange(500)):
+        assert len(set(np.diff(t))) > 1
+        grid = time_grid(t)
+        assert len(grid.steps) == 1
+        assert grid.step_index[1:].tolist() == [0] * (len(t) - 1)
+        assert grid.steps[0].item() * (len(t) - 1) == pytest.approx(t[-1] - t[0], rel=1e-12)
+
+
+def test_steps_further_apart_than_rounding_are_kept_apart():
+    last = np.spacing(0.2)
+    assert len(time_grid([0.0, 0.1, 0.2 + 2.0 * last]).steps) == 1
+    t = np.array([0.0, 0.1, 0.2 + 4.0 * last])
     assert time_grid(t).steps.tolist() == sorted(set(np.diff(t)))
-    assert len(time_grid(t).steps) == 2
+    chain = np.cumsum(np.concatenate([[0.0], 1.0 + 1e-14 * np.arange(200)]))  # no step is near all
+    grid = time_grid(chain)
+    assert 10 < len(grid.steps) < 100
+    assert np.abs(grid.steps.numpy()[grid.step_index[1:]] - np.diff(chain)).max() < 1e-13
+    repeated = time_grid([1.0, 1.0, np.nextafter(1.0, 2.0)])
+    assert repeated.step_index.tolist() == [-1, -1, 0]
 
 
 def test_one_sample():

@@ -6,14 +6,12 @@ import pytest
 import torch
 from hypothesis import given
 
-from pyro_dynogp.lti.covariance import state_covariance
+from pyro_dynogp.lti.covariance import jitter_variance, observability, state_covariance
 from pyro_dynogp.lti.dense import DenseCovariance
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.semiseparable import (
     NotPositiveDefiniteError,
     SemiseparableCovariance,
-    jitter_variance,
-    observability,
 )
 from tests.lti import oracles
 from tests.lti.oracles import NOISES, assert_close, few, random_system, tensor

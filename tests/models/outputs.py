@@ -1,12 +1,15 @@
 """Output processes for tests: of systems without a record, and of linear fits."""
 
 from contextlib import contextmanager
+from dataclasses import replace
 from unittest import mock
 
 import numpy as np
 
 import pyro_dynogp as dgp
+from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.models.outputs import engine_for, output_process
+from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.prediction.first_state import beginning
 
 
@@ -31,7 +34,10 @@ def outputs_along(system, time, inputs, scale=None, shift=None, engine=None):
     """Outputs of a system along times and scaled inputs (n, n_u), by an engine or the usual one."""
     n_y = system.wires[-1].layer.outputs
     scaling = unit_scaling(inputs.shape[-1], n_y, scale, shift)
-    return (engine or engine_for(system))(system, scaling, time, inputs)
+    # Times may be repeated here; a record's may not.
+    record = dgp.Record(np.arange(len(time)), inputs, np.zeros((len(time), n_y)))
+    prepared = replace(PreparedRecord.of(record, scaling), grid=time_grid(time))
+    return (engine or engine_for(system))(system, prepared)
 
 
 @contextmanager
@@ -48,5 +54,6 @@ def physical_of(fit):
 
 def prior_process(fit, record, *, unknown_start=False):
     """Noise-free trajectories of a linear fit along a record, for each draw."""
-    system = beginning(fit, record, predicting=unknown_start)
-    return output_process(system, fit.scaling, record).process.process
+    (along,) = fit.model.prepare(record)
+    system = beginning(fit, along, predicting=unknown_start)
+    return output_process(system, along).process.process

@@ -71,8 +71,8 @@ def test_a_late_input_does_not_spoil_the_poles(record: dgp.Record) -> None:
 
 
 def test_residuals_are_missing_where_inputs_are_not_known(record: dgp.Record) -> None:
-    prompt = residuals_of(quick_fit(MODEL, record, 0), record)
-    late = residuals_of(quick_fit(later(LATE), record, 0), record)
+    prompt = residuals_of(quick_fit(MODEL, record, 0), record, settings=dgp.LoopSettings())
+    late = residuals_of(quick_fit(later(LATE), record, 0), record, settings=dgp.LoopSettings())
     missing = [int(np.isnan(one.output).sum()) for one in (prompt, late)]
     assert LATE <= missing[1] <= LATE + 0.1 * N
     assert np.isfinite(late.output[missing[1] :]).all()

@@ -17,7 +17,7 @@ def line_case(outputs, inputs, irregular, **options):
     record = make_record(inputs, outputs, irregular=irregular)
     model = model.scaled_to(record)
     system = system_at(model, values_of(model, record, seed=outputs + 2 * irregular))
-    return record, ClosedLoop(model, system, record), output_process(system, model.scaling, record)
+    return record, ClosedLoop(model, system, record), output_process(system, *model.prepare(record))
 
 
 @pytest.mark.parametrize(("outputs", "inputs", "irregular"), CASES)
@@ -94,7 +94,7 @@ def test_runs_with_drawn_functions_are_those_of_a_plain_simulation():
     expected = loop.simulate(functions, rng)[..., 0]
     with torch.random.fork_rng():
         torch.manual_seed(1)
-        process = output_process(system, model.scaling, record)
+        process = output_process(system, *model.prepare(record))
         found = loop.scaled(process.sample((count,)).numpy()[..., None])[..., 0]
     assert expected[:, 30].std() > 2.0 * float(loop.noise[0]) ** 0.5
     for time in (5, 12, 20, 30, 39):

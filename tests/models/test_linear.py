@@ -95,7 +95,8 @@ def test_likelihood_is_in_the_units_of_the_record(record):
     trace = draw(model, short)
     trace.compute_log_prob()
     values = latent(trace)
-    observed = output_process(model.system(values, model.scaling), model.scaling, short).process
+    (along,) = model.prepare(short)
+    observed = output_process(model.system(values, model.scaling), along).process
     system, process = model.system(values, model.scaling).physical(model.scaling), observed.process
     S = signal_covariance(system.modes, short.time, short.time, process.initial_covariance)
     K = S + system.noise_sd**2 * torch.eye(40, dtype=torch.float64)
@@ -118,11 +119,12 @@ def test_integrated_initial_state_is_the_average_over_sampled_ones(record):
         states = torch.randn(count, 2).double()
     y = torch.as_tensor(short.outputs[:, 0].copy())
     begun = sampled.begin(system, {"g": states})
-    conditional = output_process(begun, sampled.scaling, short).log_prob(y)
+    (along,) = sampled.prepare(short)
+    conditional = output_process(begun, along).log_prob(y)
     average = float(torch.logsumexp(conditional, 0) - math.log(count))
     ratio = (conditional - conditional.max()).exp()
     error = float(ratio.std() / ratio.mean()) / math.sqrt(count)
-    exact = float(output_process(system, integrated.scaling, short).log_prob(y))
+    exact = float(output_process(system, along).log_prob(y))
     assert error < 0.05
     assert abs(average - exact) < 4 * error
 

@@ -13,7 +13,7 @@ import pyro_dynogp as dgp
 from pyro_dynogp.fitting import Fit
 from pyro_dynogp.inference.posteriors import Sampled
 from pyro_dynogp.lti.state import ModalState
-from pyro_dynogp.models.system import scaled_inputs
+from pyro_dynogp.models.prepared import PreparedRecord
 
 
 def steps_record(n=120, step=0.1, seed=0, hold=8):
@@ -104,7 +104,7 @@ def wiener_data(fit, n=120, seed=0, x0=None, **names):
     """A record simulated from a known Wiener system at rest, and its g (n,)."""
     layer = fit.system.layer("g")
     record = steps_record(n, seed=seed + 100)
-    u = scaled_inputs(fit.scaling, record)
+    u = PreparedRecord.of(record, fit.scaling).scaled_inputs
     start = torch.zeros_like(layer.modes.poles[0]) if x0 is None else x0
     state = ModalState(start, layer.prior_state().covariance[0] - layer.past_inputs[0])
     rng = np.random.default_rng([seed, 7])

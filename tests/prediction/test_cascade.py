@@ -12,7 +12,7 @@ from scipy.stats import kurtosis
 
 import pyro_dynogp as dgp
 from pyro_dynogp.distributions.process import ConditionedLTIProcess
-from pyro_dynogp.models.system import scaled_inputs
+from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.prediction.first_state import estimate
 from tests.models.outputs import by_moments, physical_of, prior_process
 from tests.prediction.known import (
@@ -238,7 +238,7 @@ class TestWiener:
         found = known.layers(record)["g"]
         layer = known.system.layer("g")
         start = known.model.begin(known.system, {}).layer("g").prior_state()
-        u = scaled_inputs(known.scaling, record)
+        u = PreparedRecord.of(record, known.scaling).scaled_inputs
         count = 200_000
         process = dgp.LTIProcess(layer.modes, record.time, u, start)
         with torch.random.fork_rng(), torch.no_grad():
@@ -259,7 +259,7 @@ class TestWiener:
         record, _ = wiener_data(known, n=60)
         found = known.layers(record.select(outputs=[]))["g"]
         modes = known.system.layer("g").modes
-        u = scaled_inputs(known.scaling, record)
+        u = PreparedRecord.of(record, known.scaling).scaled_inputs
         process = dgp.LTIProcess(modes, record.time, u)
         np.testing.assert_allclose(found.draw_mean[..., 0], process.mean.numpy(), atol=1e-9)
         np.testing.assert_allclose(found.sd, 0.3, rtol=1e-6)  # stationary from the start
@@ -377,9 +377,9 @@ class TestBeginning:
         x0 = torch.tensor([0.5 - 0.6j], dtype=torch.complex128)
         record, g = wiener_data(fit, n=60, x0=x0)
         modes = fit.system.layer("g").modes[0]
-        z = estimate(fit, record)["g"]
+        z = estimate(fit, PreparedRecord.of(record, fit.scaling))["g"]
         found = fit.model.begin(fit.system, {"g": z}).layer("g").first_state[0]
-        u = scaled_inputs(fit.scaling, record)
+        u = PreparedRecord.of(record, fit.scaling).scaled_inputs
         response = dgp.LTIProcess(modes, record.time, u, found).mean.numpy()
         assert np.abs(response - g)[:20].max() < 0.25  # process noise has sd 0.05 times a few
         rest = dgp.LTIProcess(modes, record.time, u).mean.numpy()
@@ -405,7 +405,7 @@ class TestNoise:
         draws["log_noise_values"] = torch.tensor([[[-2.0, -1.0, 1.0, 2.0]]], dtype=torch.float64)
         fit = fit_of(fit.model, draws, fit.scaling)
         record, _ = wiener_data(fit, n=300)
-        u = scaled_inputs(fit.scaling, record)
+        u = PreparedRecord.of(record, fit.scaling).scaled_inputs
         scale = fit.scaling.output_scale
         sd = scale * fit.system.noise.sd(u)[0].numpy()
         assert sd.max() > 2 * sd.min()
@@ -424,7 +424,9 @@ class TestNoise:
         record, _ = wiener_data(fit, n=300)
         # By definition: f's mean along g's mean response, through the noise's function.
         modes = fit.system.layer("g").modes
-        g = dgp.LTIProcess(modes, record.time, scaled_inputs(fit.scaling, record)).mean
+        g = dgp.LTIProcess(
+            modes, record.time, PreparedRecord.of(record, fit.scaling).scaled_inputs
+        ).mean
         output = fit.system.layer("f").function.mean(g.reshape(1, -1, 1))
         sd = 0.1 * fit.scaling.output_scale * fit.system.noise.log_sd.mean(output)[0].exp().numpy()
         assert sd.max() > 2 * sd.min()

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from scipy import optimize, stats
 
 import pyro_dynogp as dgp
-from pyro_dynogp.prediction.mixture_score import mixture_crps
+from pyro_dynogp.prediction import mixture_score
+from pyro_dynogp.prediction.mixture_score import mixture_scores
 from pyro_dynogp.prediction.prediction import Parts, Prediction
 
 
@@ -137,7 +138,7 @@ def test_crps_and_quantiles_of_any_mixture(draws, spread, ratio, seed):
     weight = rng.dirichlet(np.ones(draws))
     y = spread * rng.standard_normal(5)
     expected = scoringrules.crps_mixnorm(y, mean.T, sd.T, np.broadcast_to(weight, (5, draws)))
-    found = mixture_crps(y, mean, sd, weight)
+    found = mixture_scores(y, mean, sd, weight).crps
     # The closed form subtracts numbers as large as the spread and the widest component.
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12 * (spread + ratio))
 
@@ -154,6 +155,34 @@ def test_crps_and_quantiles_of_any_mixture(draws, spread, ratio, seed):
             # Where a gap between components leaves no density, many points have the level.
             near = abs(ours[k, 0] - root) <= 1e-8 * (1.0 + abs(root))
             assert near or abs(excess(ours[k, 0], *arguments)) < 1e-14
+
+
+@pytest.mark.parametrize(("spread", "ratio"), [(0.01, 1.01), (0.3, 1.5), (5.0, 3.0), (30.0, 2.0)])
+def test_crps_of_many_components(spread, ratio, monkeypatch):
+    """The sum over nodes beside scoringrules' sum over pairs of components, and beside ours."""
+    rng = np.random.default_rng(1)
+    mean = 1e3 + spread * rng.standard_normal((150, 20))
+    sd = ratio ** rng.uniform(-1.0, 1.0, (150, 20))
+    weight = rng.dirichlet(np.ones(150))
+    y = 1e3 + (1.0 + spread) * rng.standard_normal(20)
+    expected = scoringrules.crps_mixnorm(y, mean.T, sd.T, np.broadcast_to(weight, (20, 150)))
+    nodes = mixture_scores(y, mean, sd, weight).crps
+    np.testing.assert_allclose(nodes, expected, rtol=1e-10, atol=1e-10)
+    monkeypatch.setattr(mixture_score, "NODES", 1)  # no room: pairs of components
+    pairs = mixture_scores(y, mean, sd, weight).crps
+    np.testing.assert_allclose(nodes, pairs, rtol=1e-10, atol=1e-10)
+    assert not np.array_equal(nodes, pairs)
+
+
+def test_log_density_and_level_of_a_mixture():
+    """Beside the prediction's own, far out, too."""
+    p, record = scored(7, n=60)
+    y = record.outputs[:, 0] * np.linspace(0.0, 40.0, 60)
+    found = mixture_scores(
+        y, p.component_mean[:, :, 0], p.component_sd[:, :, 0], p.component_weights
+    )
+    np.testing.assert_allclose(found.log_density, p.log_density(y[:, None])[:, 0], rtol=1e-12)
+    np.testing.assert_allclose(found.level, p.probability_integral(y[:, None])[:, 0], atol=1e-14)
 
 
 def excess(x, weight, mean, sd, level):

@@ -8,6 +8,7 @@ import torch
 
 import pyro_dynogp as dgp
 from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.methods.base import Problem
 from tests.references.cases import drives, furnace, two_outputs
 
 STORED = json.loads((Path(__file__).parent / "values.json").read_text())
@@ -35,14 +36,12 @@ def test_log_joint_at_the_stored_mode(name):
     stored = STORED["fits"][name]
     make, records = MODELS[name]
     model, records = make(), records()
-    prepared = model.check(records)
-    scaled = model.scaled_to(prepared).collapsed
-    sites = scaled.all_sites(scaled.scaling, len(prepared))
+    problem = Problem.of(model, records)
+    sites = problem.target.all_sites(problem.scaling, len(problem.records))
     assert {site.name for site in sites} == set(stored["mode"])
     values = {
         site.name: torch.tensor(stored["mode"][site.name]).double().reshape(site.shape)
         for site in sites
     }
-    argument = prepared[0] if len(prepared) == 1 else prepared
-    found = float(Potential(scaled, (argument,), values).log_joint(values))
+    found = float(Potential(problem.target, (problem.records,), values).log_joint(values))
     assert found == pytest.approx(stored["log_joint"], rel=1e-9)

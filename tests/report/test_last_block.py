@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from pyro_dynogp import LoopSettings
 from pyro_dynogp.report.last_block import does_not_pay
 
 BEFORE = {"rmse": 1.0, "crps": 0.5}
@@ -21,7 +22,7 @@ BEFORE = {"rmse": 1.0, "crps": 0.5}
     ],
 )
 def test_what_does_not_pay_is_said(after: dict[str, float], gain: float, warned: bool) -> None:
-    found = does_not_pay(BEFORE, after, gain, 3.0)
+    found = does_not_pay(BEFORE, after, gain, 3.0, LoopSettings())
     assert bool(found) is warned
     if warned:
         assert f"CRPS 0.5 -> {after['crps']:.3g}, elpd {gain:+.1f} +- 3.0 nats" in found[0]

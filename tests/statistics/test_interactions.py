@@ -7,6 +7,7 @@ import pytest
 
 from pyro_dynogp.statistics.interactions import COSINES, DELAYS, INPUTS, SINES, interactions
 from pyro_dynogp.statistics.omnibus import beyond_catalogue
+from tests.discrepancy.made import SETTINGS
 from tests.discrepancy.series import in_other_units, residuals, share
 
 
@@ -71,7 +72,7 @@ def test_without_inputs_only_a_mean_that_moves_may_change(moves):
         mean = r.mean if moves else np.full(300, 2.0)
         r = dataclasses.replace(r, inputs=np.zeros((300, 0)), input_names=(), mean=mean)
         assert len(interactions(r)) == (len(COSINES) + len(SINES) if moves else 0)
-        p_values.append(beyond_catalogue(r).p_value)
+        p_values.append(beyond_catalogue(r, SETTINGS).p_value)
     assert np.median(p_values) > 0.05
 
 

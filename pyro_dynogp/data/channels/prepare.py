@@ -29,9 +29,6 @@ KINDS: dict[str, type[Channel]] = {
         Sinusoid, Calendar, ShiftedClock,
     )
 }  # fmt: skip
-# A record never changes, and keeps what it was last prepared to: a likelihood prepares its record
-# at every evaluation, and channels of the clock cost half as much as all the rest of one.
-LAST = 4
 
 
 def prepared(record: Record, channels: Sequence[Channel]) -> Record:
@@ -47,20 +44,6 @@ def prepared(record: Record, channels: Sequence[Channel]) -> Record:
     made = {name for channel in channels for name in channel.names} - replaced
     if made <= set(record.input_names):
         return record
-    key = tuple(channels)
-    kept: dict[Any, Record] = record.__dict__.setdefault("_prepared", {})
-    try:
-        known = kept.get(key)
-    except TypeError:  # a channel with fields that have no hash, a list for example
-        return _prepared(record, channels)
-    if known is None:
-        known = _prepared(record, channels)
-        last = list(kept.items())[1 - LAST :]
-        record.__dict__["_prepared"] = {**dict(last), key: known}
-    return known
-
-
-def _prepared(record: Record, channels: Sequence[Channel]) -> Record:
     names, last = list(record.input_names), list[str]()
     values = {name: record.inputs[:, i] for i, name in enumerate(names)}
     units = dict(zip(names, record.input_units, strict=True))

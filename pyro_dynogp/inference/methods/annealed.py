@@ -1,10 +1,12 @@
 r"""Annealed sequential Monte Carlo: particles carried from one density to another, all at once.
 
 Particles of a density p_0 follow p_0^{1-b} p_1^b from b = 0 to 1. Each step of b is as long as half
-of them stay effective; they are resampled, and moved by Hamiltonian Monte Carlo in coordinates
-whitened by their own covariance (Del Moral, Doucet & Jasra 2006; Buchholz, Chopin & Jacob 2021).
-What comes out are draws of p_1 and the ratio of the two normalising constants. No normal shape is
-assumed: ridges and pairs that swap places are no obstacle where the particles of p_0 cover them.
+of them stay effective; a quarter as many are resampled, and moved by Hamiltonian Monte Carlo in
+coordinates whitened by the particles' own covariance (Del Moral, Doucet & Jasra 2006; Buchholz,
+Chopin & Jacob 2021). All states that the moves pass through are particles of the next step, so that
+no density is evaluated in vain (Dau & Chopin, J. R. Stat. Soc. B 84:114, 2022). What comes out are
+draws of p_1 and the ratio of the two normalising constants. No normal shape is assumed: ridges and
+pairs that swap places are no obstacle where the particles of p_0 cover them.
 
 All particles go through the model together, so that one evaluation costs little more than the
 compiled recursions do.
@@ -14,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -22,16 +24,20 @@ from pyro.distributions import MultivariateStudentT
 from torch import Tensor
 from tqdm import tqdm
 
-from pyro_dynogp.inference.density import Site, each_with_gradient, joint_energy
-from pyro_dynogp.inference.posteriors import Mixture
+from pyro_dynogp.inference.density import Potential, each_with_gradient
 
-# Effective share of particles after a step; Hamiltonian moves at each temperature, and at the end.
-EFFECTIVE, MOVES, LAST_MOVES = 0.5, 2, 4
+# Effective share of particles after a step; one in so many of all particles starts a chain.
+EFFECTIVE, CHAINS = 0.5, 4
+# Hamiltonian moves of each chain at each temperature, all kept; at the end as many that are not
+# kept, and then one for each particle.
+MOVES = 2
 # Leapfrog steps of a move, at random between these; acceptance that the step size aims at.
-LEAPS, ACCEPTANCE = (4, 12), 0.8
+LEAPS, ACCEPTANCE = (3, 8), 0.8
 MOST_TEMPERATURES = 60
 # Degrees of freedom of the first particles around an optimum: tails wider than a normal's.
-FREEDOM = 5.0
+FREEDOM = 20.0
+# Samples times particles that are evaluated at once.
+AT_ONCE = 400_000
 
 # Unconstrained values (logarithms of scales, mostly) beyond which a density counts as zero.
 REACH = 40.0
@@ -46,24 +52,26 @@ class Density(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """Log p(y, values) of a Pyro model with the Jacobian of the unconstrained vector.
+    """Log p(y, values) with the Jacobian of a potential's coordinates.
 
     Attributes:
-        model, args: the model and what it is called with. sites: of the vector.
+        potential: the density. samples: of the data.
     """
 
-    model: Any
-    args: tuple[Any, ...]
-    sites: Sequence[Site]
+    potential: Potential
+    samples: int = 1
 
     def __call__(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Value (S,) and gradient (S, d)."""
         far = ~(z.abs() <= REACH).all(-1)
-        energy, slope = each_with_gradient(self._energy, z.masked_fill(far[:, None], 0.0))
+        near = z.masked_fill(far[:, None], 0.0)
+        portions = near.split(max(1, AT_ONCE // self.samples))
+        found = [each_with_gradient(self._energy, portion) for portion in portions]
+        energy, slope = (torch.cat(x) for x in zip(*found, strict=True))
         return -energy.masked_fill(far, torch.inf), -slope.masked_fill(far[:, None], 0.0)
 
     def _energy(self, z: Tensor) -> Tensor:
-        return joint_energy(self.model, self.args, self.sites, z, jacobian=True)
+        return self.potential.energy(z, jacobian=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,8 +125,8 @@ def anneal(
     """
     generator = torch.Generator().manual_seed(seed)
     count = len(z)
-    ancestor = torch.arange(count)
-    now = _evaluate(z, start, target)
+    chains = -(-count // CHAINS)
+    now = _evaluate(z, start, target, 0.0, torch.arange(count))
     b, log_evidence, size = 0.0, 0.0, 0.5
     temperatures: list[float] = []
     accepted: list[float] = []
@@ -129,40 +137,47 @@ def anneal(
                 f"annealing: after {MOST_TEMPERATURES} steps the temperature is {b:.3g} of 1. The "
                 "posterior is too far from where the particles start: use method='nuts'."
             )
-        gain = now.target - now.start
+        gain = (now.target - now.start).nan_to_num(-torch.inf, torch.inf, -torch.inf)
         if not bool(torch.isfinite(gain).any()):
             raise RuntimeError("annealing: no particle has a density under the target.")
         step = _step(gain, 1.0 - b)
         weight = step * gain
-        log_evidence += float(torch.logsumexp(weight, 0)) - float(np.log(count))
-        chosen = _resample(weight, generator)
-        now, ancestor = now.of(chosen), ancestor[chosen]
+        log_evidence += float(torch.logsumexp(weight, 0)) - float(np.log(len(gain)))
+        chosen = _resample(weight, chains, generator)
+        root = _root(now.z, torch.softmax(weight, 0))
         b = 1.0 if b + step > 1.0 - 1e-9 else b + step
-        root = _root(now.z)
-        rates = []
-        for _ in range(MOVES if b < 1.0 else LAST_MOVES):
-            now, rate = _move(now, start, target, b, root, size, generator)
+        chain, states, rates = now.of(chosen), [], []
+        for _ in range(MOVES if b < 1.0 else MOVES + CHAINS):
+            chain, rate = _move(chain, start, target, b, root, size, generator)
             # Particles tell at once how many of them were accepted.
             size = float(np.clip(size * np.exp(rate - ACCEPTANCE), 1e-3, 1.5))
+            states.append(chain)
             rates.append(rate)
+        now = _Particles.joined(states if b < 1.0 else states[MOVES:])
         temperatures.append(b)
         accepted.append(float(np.mean(rates)))
         bar.update(round(100 * b) - bar.n)
     bar.close()
+    last = now.of(torch.arange(count))
     return Annealed(
-        now.z, log_evidence, tuple(temperatures), tuple(accepted), ancestor.numpy().copy()
+        last.z, log_evidence, tuple(temperatures), tuple(accepted), last.ancestor.numpy().copy()
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _Particles:
-    """Vectors with both densities and their gradients."""
+    """Vectors with both densities and their gradients, and the first particle that each is from."""
 
     z: Tensor
     start: Tensor
     target: Tensor
     start_gradient: Tensor
     target_gradient: Tensor
+    ancestor: Tensor
+
+    @classmethod
+    def joined(cls, several: Sequence[_Particles]) -> _Particles:
+        return cls(*(torch.cat(x) for x in zip(*(one._all() for one in several), strict=True)))
 
     def of(self, index: Tensor) -> _Particles:
         return _Particles(*(x[index] for x in self._all()))
@@ -177,7 +192,8 @@ class _Particles:
         )
 
     def _all(self) -> tuple[Tensor, ...]:
-        return self.z, self.start, self.target, self.start_gradient, self.target_gradient
+        densities = self.start, self.target, self.start_gradient, self.target_gradient
+        return self.z, *densities, self.ancestor
 
     def at(self, b: float) -> tuple[Tensor, Tensor]:
         """Log-density (S,) and gradient (S, d) at temperature b."""
@@ -185,10 +201,11 @@ class _Particles:
         return value, b * self.target_gradient + (1.0 - b) * self.start_gradient
 
 
-def _evaluate(z: Tensor, start: Density, target: Density) -> _Particles:
-    first, first_gradient = start(z)
+def _evaluate(z: Tensor, start: Density, target: Density, b: float, ancestor: Tensor) -> _Particles:
     last, last_gradient = target(z)
-    return _Particles(z, first, last, first_gradient, last_gradient)
+    # At the end the start counts no more, and may cost as much as the target.
+    first, first_gradient = start(z) if b < 1.0 else (last, last_gradient)
+    return _Particles(z, first, last, first_gradient, last_gradient, ancestor)
 
 
 def _step(gain: Tensor, most: float) -> float:
@@ -208,20 +225,20 @@ def _step(gain: Tensor, most: float) -> float:
     return max(low, 1e-6 * most)
 
 
-def _resample(log_weight: Tensor, generator: torch.Generator) -> Tensor:
-    """Systematic resampling: indices (S,)."""
-    count = len(log_weight)
+def _resample(log_weight: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Systematic resampling: indices (count,)."""
     edges = torch.cumsum(torch.softmax(log_weight, 0), 0)
     shift = torch.rand((), generator=generator, dtype=torch.float64)
     at = (torch.arange(count, dtype=torch.float64) + shift) / count * edges[-1]
-    return torch.searchsorted(edges, at).clamp_max(count - 1)
+    return torch.searchsorted(edges, at).clamp_max(len(log_weight) - 1)
 
 
-def _root(z: Tensor) -> Tensor:
-    """Cholesky factor (d, d) of the particles' covariance, shrunk to its diagonal."""
-    count, d = z.shape
-    covariance = torch.cov(z.mT).reshape(d, d)
-    share = d / (d + count)
+def _root(z: Tensor, weight: Tensor) -> Tensor:
+    """Cholesky factor (d, d) of the covariance of weighted particles, shrunk to its diagonal."""
+    d = z.shape[1]
+    off = z - weight @ z
+    covariance = (off.mT * weight) @ off
+    share = d / (d + 1.0 / float(weight.square().sum()))
     diagonal = covariance.diagonal().clamp_min(1e-12)
     return torch.linalg.cholesky((1.0 - share) * covariance + share * torch.diag(diagonal))
 
@@ -247,7 +264,7 @@ def _move(
     there = now
     for leap in range(leaps):
         momentum = momentum + (0.5 if leap == 0 else 1.0) * h * (gradient @ root)
-        there = _evaluate(there.z + (h * momentum) @ root.mT, start, target)
+        there = _evaluate(there.z + (h * momentum) @ root.mT, start, target, b, now.ancestor)
         value, gradient = there.at(b)
     momentum = momentum + 0.5 * h * (gradient @ root)
     change = value - 0.5 * momentum.square().sum(-1) - energy
@@ -258,13 +275,11 @@ def _move(
     return there.where(accept, now), rate
 
 
-def around(normal: Mixture, count: int, seed: int) -> tuple[Tensor, Student]:
-    """First particles (S, d) around a normal, and their density."""
-    loc, root = normal.loc[0], normal.scale_tril[0]
-    student = Student(loc, root)
+def around(loc: Tensor, root: Tensor, count: int, seed: int) -> tuple[Tensor, Student]:
+    """First particles (S, d) around a normal of mean (d,) and root (d, d), and their density."""
     generator = torch.Generator().manual_seed(seed)
     x = torch.randn(count, len(loc), generator=generator, dtype=torch.float64)
     # A chi-squared number by the sum of squares: torch's gamma takes no generator.
     squares = torch.randn(count, int(FREEDOM), generator=generator, dtype=torch.float64)
     spread = (FREEDOM / squares.square().sum(-1, keepdim=True)).sqrt()
-    return loc + spread * (x @ root.mT), student
+    return loc + spread * (x @ root.mT), Student(loc, root)

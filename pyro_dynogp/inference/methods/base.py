@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Protocol
 
+import numpy as np
 from torch import Tensor
 
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.posteriors import Posterior
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.prepared import PreparedRecord, as_measured
+from pyro_dynogp.support.frozen import FrozenMapping
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,8 +29,23 @@ class Problem:
     """
 
     model: Model
-    records: tuple[Record, ...]
+    records: tuple[PreparedRecord, ...]
     learnt: Mapping[str, Tensor] | None = None
+
+    @classmethod
+    def of(
+        cls, model: Model, records: Record | Sequence[Record], start: Fitted | None = None
+    ) -> Problem:
+        """Records checked and prepared, the model in their units; `start` is a fit to start from.
+
+        Raises:
+            ValueError: as of `Model.check`; on constant or entirely missing signals.
+        """
+        checked = model.check(records)
+        scaling = Scaling.from_records(checked)
+        prepared = tuple(PreparedRecord.of(record, scaling) for record in checked)
+        learnt = None if start is None else dict(start.mode)
+        return cls(replace(model, scaling=scaling), prepared, learnt)
 
     @property
     def target(self) -> Model:
@@ -33,9 +53,33 @@ class Problem:
         return self.model.collapsed
 
     @property
-    def argument(self) -> Record | tuple[Record, ...]:
-        """What the Pyro model is called with."""
-        return self.records[0] if len(self.records) == 1 else self.records
+    def scaling(self) -> Scaling:
+        """In whose units the model is fitted."""
+        return self.records[0].scaling
+
+    @property
+    def identity(self) -> tuple[object, ...]:
+        """Everything that changes the result, with the same `repr` in every process."""
+        own = (self.model, [each.record.fingerprint for each in self.records])
+        if self.learnt is None:
+            return own
+        return (*own, {name: value.tolist() for name, value in self.learnt.items()})
+
+    def fitted(
+        self,
+        run: Run,
+        posterior: Posterior,
+        draws: Mapping[str, Tensor],
+        mode: Mapping[str, Tensor],
+        history: np.ndarray,
+        energies: Sequence[float] | np.ndarray,
+        diagnostics: Mapping[str, float],
+    ) -> Fitted:
+        """The fit that a method has come to; arguments as the fields of `Fitted`."""
+        return Fitted(
+            self.model, posterior, FrozenMapping(draws), FrozenMapping(mode), history,
+            np.asarray(energies), FrozenMapping(diagnostics), run.seed, as_measured(self.records),
+        )  # fmt: skip
 
 
 class Method(Protocol):

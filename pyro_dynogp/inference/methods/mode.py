@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, get_args
+from itertools import zip_longest
+from types import MappingProxyType
+from typing import get_args
 
 import numpy as np
 
-from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.density import WALL
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.free_runs import free_run_error, noise_pays, silenced
 from pyro_dynogp.inference.methods.base import Problem
-from pyro_dynogp.inference.optimise.maximum import EFFORT, Optimizer, Optimum, maximise
+from pyro_dynogp.inference.optimise.gauss_newton import has_innovations
+from pyro_dynogp.inference.optimise.maximum import EFFORT, Effort, Optimizer, Optimum, maximise
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.plans import (
@@ -26,21 +29,26 @@ from pyro_dynogp.inference.starts.plans import (
     starting_point,
 )
 from pyro_dynogp.inference.starts.poles import grown, starting_values
+from pyro_dynogp.inference.starts.subspace import subspace_starts
 from pyro_dynogp.layers.noise import TYPICAL
 from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.prepared import PreparedRecord, Records, as_measured
 from pyro_dynogp.models.variants import without_noise_below_functions
 from pyro_dynogp.models.wiring import Dynamic
-from pyro_dynogp.support.checkpoints import NOTHING_KEPT, Checkpoints
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import seeded
 
-# Starts and iterations of the linear fits that come first.
-LINEAR_STARTS = 6
-LINEAR_STEPS = 150
-# Sets of starts of a model with feedback, until one beats the linear model in free runs; what is
-# said where none does.
-ATTEMPTS = 2
+# Most iterations of linear fits by each optimizer.
+STEPS: Mapping[str, int] = MappingProxyType(
+    {"gauss-newton": 100, "lbfgs": 500, "preconditioned": 500, "adam": 1500}
+)
+# Most starts of linear fits of each kind; iterations of those that come before cascades.
+RANDOM = 6
+LINEAR_STEPS = 40
+# Starts of a model with feedback; sets of them, until one beats the linear model in free runs; what
+# is said where none does.
+FEEDBACK_STARTS, ATTEMPTS = 4, 2
 NO_BETTER = (
     "fit: free runs through the training record are no better than those of the linear model that "
     "the climb began from. Try more pairs, other restarts (seed), or a longer record."
@@ -51,41 +59,36 @@ UNEXPLAINED = 0.5
 
 def starting_points(
     model: Model,
-    records: Sequence[Record],
+    records: Sequence[PreparedRecord],
+    run: Run,
+    *,
     count: int,
     steps: int,
-    seed: int,
-    workers: int | None,
-    progress: bool,
-    checkpoints: Checkpoints,
 ) -> list[Values]:
     """Values of every site for each restart, from the optima of linear fits."""
-    assert model.scaling is not None
+    scaling = records[0].scaling
     optima: dict[str, Sequence[Values]] = {}
-    known: dict[Any, Sequence[Values]] = {}
+    known: dict[Model, Sequence[Values]] = {}
     for one in leading_layers(model):
         assert isinstance(one.layer, Dynamic)
-        twin = linear_twin(model, one.layer, model.scaling)
-        if twin not in known:
-            training = _one_output(records) if twin.outputs < model.outputs else tuple(records)
-            twin = twin.scaled_to(training)
+        linear = linear_twin(model, one.layer, scaling)
+        if linear not in known:
+            training = tuple(records) if linear.outputs == model.outputs else _one_output(records)
+            twin = replace(linear, scaling=training[0].scaling)
             found = maximise(
                 twin,
-                training if len(training) > 1 else training[0],
-                starting_values(twin, training, count=LINEAR_STARTS, seed=seed),
+                training,
+                linear_starts(twin, training, None, run.seed),
+                run,
+                optimizer=optimizer_for(twin),
                 steps=min(LINEAR_STEPS, steps),
-                seed=seed,
-                workers=workers,
-                progress=progress,
-                checkpoints=checkpoints,
                 key=f"linear-{one.name}",
             )
-            known[twin] = [optimum.values for optimum in found]
-        optima[one.name] = known[twin]
-    with seeded(seed):  # what has no typical value is drawn
+            known[linear] = [optimum.values for optimum in found]
+        optima[one.name] = known[linear]
+    with seeded(run.seed):  # what has no typical value is drawn
         return [
-            starting_point(model, records, model.scaling, plan)
-            for plan in plans(model, optima, count, seed)
+            starting_point(model, records, plan) for plan in plans(model, optima, count, run.seed)
         ]
 
 
@@ -102,8 +105,11 @@ def _louder(values: Values) -> Values:
     }
 
 
-def _one_output(records: Sequence[Record]) -> tuple[Record, ...]:
-    return tuple(record.select(outputs=[record.output_names[0]]) for record in records)
+def _one_output(records: Sequence[PreparedRecord]) -> tuple[PreparedRecord, ...]:
+    names = [records[0].record.output_names[0]]
+    selected = [each.record.select(outputs=names) for each in records]
+    scaling = Scaling.from_records(selected)
+    return tuple(PreparedRecord.of(record, scaling) for record in selected)
 
 
 @dataclass(frozen=True)
@@ -111,9 +117,10 @@ class Mode:
     """The posterior mode: the best optimum of several starts.
 
     Attributes:
-        optimizer: "lbfgs", "preconditioned" (L-BFGS in coordinates that Hessians make round, which
-            gets to the top of long ridges) or "adam"; None for "adam" where the model has static
-            layers but no feedback, else "lbfgs". The highest mode may be one that fits the noise.
+        optimizer: "gauss-newton" (for linear models under Gaussian noise), "lbfgs",
+            "preconditioned" (L-BFGS in coordinates that Hessians make round, which gets to the top
+            of long ridges) or "adam"; None for what suits the model, see `optimizer_for`. The
+            highest mode may be one that fits the noise.
 
     Raises:
         ValueError: on an unknown optimizer.
@@ -125,7 +132,8 @@ class Mode:
         check_optimizer(self.optimizer)
 
     def check(self, model: Model, *, warm: bool) -> None:
-        """Every model has a mode."""
+        """Every model has a mode; not every optimizer takes every model."""
+        check_optimizer(self.optimizer, model)
 
     @property
     def identity(self) -> object:
@@ -138,15 +146,25 @@ class Mode:
         return at_optimum(problem.model, optima, run.seed, problem.records)
 
 
-def check_optimizer(optimizer: Optimizer | None) -> None:
-    """Refuse an optimizer that there is not.
+def check_optimizer(optimizer: Optimizer | None, model: Model | None = None) -> None:
+    """Refuse an optimizer that there is not, or that cannot climb a given model's posterior.
 
     Raises:
-        ValueError: on an unknown name.
+        ValueError: on such a name.
     """
-    if optimizer is not None and optimizer not in get_args(Optimizer):
-        expected = "'lbfgs', 'preconditioned' or 'adam'"
-        raise invalid("optimizer", expected=expected, got=repr(optimizer))
+    names = list(get_args(Optimizer))
+    if model is not None and not has_innovations(model):
+        names.remove("gauss-newton")
+    if optimizer is not None and optimizer not in names:
+        *most, last = (repr(name) for name in names)
+        raise invalid("optimizer", expected=f"{', '.join(most)} or {last}", got=repr(optimizer))
+
+
+def optimizer_for(model: Model) -> Optimizer:
+    """Gauss-Newton where outputs have Gaussian innovations, Adam where functions end no loop."""
+    if has_innovations(model):
+        return "gauss-newton"
+    return "adam" if model.has_function and not model.has_feedback else "lbfgs"
 
 
 def best_optima(
@@ -162,39 +180,16 @@ def best_optima(
         ValueError: where no start leads to a point with a density.
     """
     model, records, learnt = problem.model, problem.records, problem.learnt
-    optimizer = optimizer or suited_optimizer(model)
-    restarts = run.restarts or (4 if model.has_feedback else 8 if model.has_function else 6)
-    options: dict[str, Any] = {
-        "optimizer": optimizer, "seed": run.seed, "workers": run.workers,
-        "progress": run.progress, "checkpoints": run.checkpoints,
-    }  # fmt: skip
+    optimizer = optimizer or optimizer_for(model)
     if model.is_linear:
-        starts = starting_values(model, records, count=restarts, seed=run.seed)
+        starts = linear_starts(model, records, run.restarts, run.seed)
         if learnt is not None:
             starts = [grown(learnt, starts[0]), *starts]
-        steps = steps or (1500 if optimizer == "adam" else 500)
-        optima = maximise(problem.target, problem.argument, starts, steps=steps, **options)
+        steps = steps or STEPS[optimizer]
+        optima = maximise(problem.target, records, starts, run, steps=steps, optimizer=optimizer)
     else:
         steps = steps or 600
-        optima, least = [], math.inf
-        for attempt in range(ATTEMPTS if model.has_feedback else 1):
-            starts = starting_points(
-                problem.target, records, restarts, steps, run.seed + attempt, run.workers,
-                run.progress, run.checkpoints,
-            )  # fmt: skip
-            warm = [] if learnt is None else [grown(learnt, starts[0])]
-            options["prefix"] = f"again-{attempt}-" if attempt else ""
-            optima += climb(problem.target, problem.argument, starts, warm, steps=steps, **options)
-            optima.sort(key=lambda one: one.energy)
-            if not model.has_feedback:
-                break
-            # Nothing comes back in a start: it is the linear model.
-            errors = [free_run_error(problem.target, start, records) for start in starts]
-            least = min(least, *errors)
-            if free_run_error(problem.target, optima[0].values, records) < least:
-                break
-        else:
-            warnings.warn(NO_BETTER, stacklevel=2)
+        optima = climb_in_sets(problem, run, steps or 600, optimizer)
     if optima[0].energy >= WALL:
         raise ValueError(
             "fit: no start reached a point where the likelihood can be evaluated. Check the "
@@ -203,14 +198,50 @@ def best_optima(
     return optima
 
 
-def suited_optimizer(model: Model) -> Optimizer:
-    """What climbs best: Adam where functions see what dynamics make, but not in a loop."""
-    return "adam" if model.has_function and not model.has_feedback else "lbfgs"
+def climb_in_sets(problem: Problem, run: Run, steps: int, optimizer: Optimizer) -> list[Optimum]:
+    """Optima from fresh starts and from what is learnt; best first.
+
+    With feedback another set of starts follows where free runs through the training record are no
+    better than those of the starts, from which nothing comes back as yet: of the linear model.
+    """
+    model, records, learnt = problem.target, problem.records, problem.learnt
+    usual = FEEDBACK_STARTS if model.has_feedback else 8 if model.has_function else RANDOM
+    optima: list[Optimum] = []
+    least = math.inf
+    for attempt in range(ATTEMPTS):
+        again = replace(run, seed=run.seed + attempt)
+        starts = starting_points(model, records, again, count=run.restarts or usual, steps=steps)
+        warm = [] if learnt is None else [grown(learnt, starts[0])]
+        prefix = f"again-{attempt}-" if attempt else ""
+        found = climb(
+            model, records, starts, warm, again, steps=steps, optimizer=optimizer, prefix=prefix
+        )
+        optima = sorted([*optima, *found], key=lambda one: one.energy)
+        if not model.has_feedback:
+            return optima
+        least = min(least, *(free_run_error(model, start, records) for start in starts))
+        if free_run_error(model, optima[0].values, records) < least:
+            return optima
+    warnings.warn(NO_BETTER, stacklevel=2)
+    return optima
 
 
-def at_optimum(
-    model: Model, optima: Sequence[Optimum], seed: int, records: Sequence[Record]
-) -> Fitted:
+def linear_starts(
+    model: Model, records: Sequence[PreparedRecord], count: int | None, seed: int
+) -> list[Values]:
+    """Starts of a linear model: of subspace identification and with random poles, in turn.
+
+    Args:
+        model: the model. records: to which it is fitted. seed: of random poles.
+        count: how many; None for `RANDOM` of each kind, as far as there are orders.
+    """
+    subspace = subspace_starts(model, records, seed)[:RANDOM]
+    random = starting_values(model, records, count=count or RANDOM, seed=seed)
+    both = [one for pair in zip_longest(subspace, random) for one in pair if one is not None]
+    return both[:count]
+
+
+def at_optimum(model: Model, optima: Sequence[Optimum], seed: int, records: Records) -> Fitted:
     """The fit that the best of several optima is: a posterior mode."""
     best = optima[0]
     return Fitted(
@@ -222,20 +253,21 @@ def at_optimum(
         start_energies=np.array([optimum.energy for optimum in optima]),
         diagnostics=FrozenMapping({"iterations": float(len(best.history))}),
         seed=seed,
-        records=tuple(records),
+        records=as_measured(records),
     )
 
 
 def climb(
     model: Model,
-    records: Record | Sequence[Record],
+    records: Records,
     starts: Sequence[Values],
     learnt: Sequence[Values],
+    run: Run,
     *,
     steps: int,
-    checkpoints: Checkpoints = NOTHING_KEPT,
+    optimizer: Optimizer,
+    effort: Effort = EFFORT,
     prefix: str = "",
-    **options: Any,
 ) -> list[Optimum]:
     """Optima of the collapsed model from fresh starts and from what is learnt, best first.
 
@@ -245,25 +277,33 @@ def climb(
     forecasts. With feedback the noise stays only where free runs are better with it.
 
     Args:
-        model: collapsed. records: of it. starts, learnt: values of all sites.
-        steps: most of each start. checkpoints: what keeps pieces. prefix: of their keys.
-        options: of `maximise`.
+        model: collapsed. records: of it. starts, learnt: values of all sites. run: how.
+        steps: most of each start. optimizer, effort: of `maximise`. prefix: of the keys of pieces.
     """
-    options["checkpoints"] = checkpoints
-    options["effort"] = replace(options.get("effort", EFFORT), kept=0.5)
+    effort = replace(effort, kept=0.5)
+
+    def optima_of(target: Model, points: Sequence[Values], key: str) -> list[Optimum]:
+        return maximise(
+            target,
+            records,
+            points,
+            run,
+            optimizer=optimizer,
+            steps=steps,
+            key=prefix + key,
+            effort=effort,
+        )
+
     quiet = without_noise_below_functions(model)
     better: list[Optimum] = []
     if quiet != model and starts:
         steps = max(1, steps // 2)
-        key = f"{prefix}without-process-noise"
-        louder = [_louder(start) for start in starts]
-        found = maximise(quiet, records, louder, steps=steps, key=key, **options)
+        found = optima_of(quiet, [_louder(start) for start in starts], "without-process-noise")
         better = found[: (len(starts) + 1) // 2]
         starts = [grown(one.values, starts[0]) for one in better]
     elif model.has_feedback:
         starts = [_louder(start) for start in starts]
-    key = f"{prefix}cascade"
-    optima = maximise(model, records, [*learnt, *starts], steps=steps, key=key, **options)
+    optima = optima_of(model, [*learnt, *starts], "cascade")
     if not model.has_feedback or not better:
         return optima
     silent = [silenced(model, records, one, starts[0]) for one in better]
@@ -271,20 +311,21 @@ def climb(
 
 
 def grow(
-    model: Model, record: Record, learnt: Values, start: Values, *, steps: int, seed: int
+    model: Model, records: Records, learnt: Values, start: Values, run: Run, *, steps: int
 ) -> list[Optimum]:
     """Optima of the collapsed model near what a smaller model, or the same one, has learnt.
 
     Process noise that has explained what the smaller model lacks keeps the larger one from
     explaining it: one climb goes without any first, and takes that of `start` then.
     """
-    options: dict[str, Any] = {
-        "steps": steps, "seed": seed, "workers": 1, "optimizer": "preconditioned",
-    }  # fmt: skip
+
+    def climbed(target: Model, point: Values, key: str) -> Optimum:
+        return maximise(
+            target, records, [point], run, optimizer="preconditioned", steps=steps, key=key
+        )[0]
+
     starts = [learnt]
     quiet = without_noise_below_functions(model)
     if quiet != model:
-        (found, *_) = maximise(quiet, record, [_louder(learnt)], key="grown-quiet", **options)
-        starts.append(grown(found.values, start))
-    optima = [maximise(model, record, [one], key="grown", **options)[0] for one in starts]
-    return sorted(optima, key=lambda one: one.energy)
+        starts.append(grown(climbed(quiet, _louder(learnt), "grown-quiet").values, start))
+    return sorted((climbed(model, point, "grown") for point in starts), key=lambda o: o.energy)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,13 +11,19 @@ import pyro
 import torch
 from pyro.distributions import MultivariateNormal
 from pyro.infer import Trace_ELBO
-from pyro.infer.autoguide import AutoDiagonalNormal, AutoMultivariateNormal, init_to_value
+from pyro.infer.autoguide import (
+    AutoContinuous,
+    AutoDiagonalNormal,
+    AutoMultivariateNormal,
+    init_to_value,
+)
 from torch import Tensor
 
 from pyro_dynogp.inference.density import Potential
-from pyro_dynogp.inference.methods.svi import train
+from pyro_dynogp.inference.methods.svi import Schedule, train
 from pyro_dynogp.inference.posteriors import Mixture
-from pyro_dynogp.support.checkpoints import NOTHING_KEPT, Checkpoints
+from pyro_dynogp.inference.run import Run
+from pyro_dynogp.layers.sites import Arguments, Program
 
 # Divergence of Laplace's approximation from the posterior [nats] that SVI does not mend, the draws
 # that it is found from, and what is said then.
@@ -32,15 +38,15 @@ class PreconditionedNormal(AutoMultivariateNormal):
     is the same, but one learning rate suits all coordinates.
     """
 
-    def __init__(self, model: Any, centre: Tensor, root: Tensor, **kwargs: Any) -> None:
+    def __init__(self, model: Program, centre: Tensor, root: Tensor, **kwargs: Any) -> None:
         super().__init__(model, init_scale=1.0, **kwargs)
         self.centre, self.root = centre, root
 
-    def _setup_prototype(self, *args: Any, **kwargs: Any) -> None:
+    def _setup_prototype(self, *args: object, **kwargs: Any) -> None:
         super()._setup_prototype(*args, **kwargs)
         self.loc = torch.nn.Parameter(torch.zeros_like(self.centre))
 
-    def get_posterior(self, *args: Any, **kwargs: Any) -> MultivariateNormal:
+    def get_posterior(self, *args: object, **kwargs: Any) -> MultivariateNormal:
         """Posterior of the unconstrained vector."""
         scale_tril = self.root @ (self.scale[..., None] * self.scale_tril)
         return MultivariateNormal(self.centre + self.root @ self.loc, scale_tril=scale_tril)
@@ -61,66 +67,66 @@ class VariationalPosterior:
 
 
 def variational(
-    model: Any,
-    args: tuple[Any, ...],
+    model: Program,
+    args: Arguments,
     values: dict[str, Tensor],
+    run: Run,
+    schedule: Schedule,
     *,
-    steps: int = 1000,
-    particles: int = 8,
-    learning_rate: float = 0.02,
-    seed: int = 0,
     independent: bool = False,
-    checkpoints: Checkpoints = NOTHING_KEPT,
     key: str = "posterior",
-    progress: bool = False,
 ) -> VariationalPosterior:
     """Fit a multivariate normal to the posterior by Pyro's SVI, from values near its mode.
 
     With `independent` its covariance is diagonal (Pyro's AutoDiagonalNormal). Stops early when the
     ELBO, averaged over 50 steps, has not risen by 0.05 nats in 200 steps, and does not start where
-    Laplace's approximation has less than that to gain, as on long records. The parameters live in a
-    scope of the parameter store of their own.
+    Laplace's approximation has less than that to gain, as on long records.
     """
     potential = Potential(model, args, values)
     if independent:
-        return _independent(
-            potential, steps, particles, learning_rate, seed, checkpoints, key, progress
-        )
+        # Narrow at first: ridges are thin.
+        at = {name: value.detach() for name, value in values.items()}
+        guide = AutoDiagonalNormal(model, init_loc_fn=init_to_value(values=at), init_scale=0.003)
+        slower = replace(schedule, learning_rate=0.2 * schedule.learning_rate)
+        return _trained(potential, guide, run, slower, key)
 
     def laplace() -> dict[str, Tensor]:
-        centre, root = potential.laplace(values, widest=2.0)
+        centre, root = potential.laplace(values)
         return {"centre": torch.as_tensor(centre), "root": torch.as_tensor(root)}
 
-    found = checkpoints.piece(f"{key}-laplace", laplace)
+    found = run.checkpoints.piece(f"{key}-laplace", laplace)
     centre, root = found["centre"], found["root"]
-    weights = checkpoints.piece(
-        f"{key}-weights", lambda: {"log": log_weights(potential, centre, root, seed)}
+    weights = run.checkpoints.piece(
+        f"{key}-weights", lambda: {"log": log_weights(potential, centre, root, run.seed)}
     )["log"]
     if 0.5 * float(weights.var()) <= CLOSE:
         elbo = np.array([float(weights.mean())])
         return VariationalPosterior(Mixture.normal(potential, centre, root), elbo, AS_GOOD)
     start = {name: value.detach() for name, value in potential.unpack(centre).items()}
     guide = PreconditionedNormal(model, centre, root, init_loc_fn=init_to_value(values=start))
-    order = [site.name for site in potential.sites]
-    loss = Trace_ELBO(num_particles=particles, vectorize_particles=True, max_plate_nesting=0)
+    return _trained(potential, guide, run, schedule, key)
+
+
+def _trained(
+    potential: Potential, guide: AutoContinuous, run: Run, schedule: Schedule, key: str
+) -> VariationalPosterior:
+    """The normal that SVI makes of a guide, in a scope of the parameter store of its own."""
+    loss = Trace_ELBO(
+        num_particles=schedule.particles, vectorize_particles=True, max_plate_nesting=0
+    )
     with pyro.get_param_store().scope(), pyro.validation_enabled(False):
         trained = train(
-            model,
-            guide,
-            args,
-            loss,
-            steps=steps,
-            learning_rate=learning_rate,
-            seed=seed,
-            checkpoints=checkpoints,
-            progress=progress,
-            key=f"{key}-svi",
+            potential.model, guide, potential.args, loss, run, schedule, key=f"{key}-svi"
         )
-        names = list(guide._unconstrained_shapes)
+        names, order = list(guide._unconstrained_shapes), [site.name for site in potential.sites]
         if names != order:
             raise RuntimeError(f"The guide orders the sites {names}, the potential {order}.")
         posterior = guide.get_posterior()
-        fitted = Mixture.normal(potential, posterior.loc, posterior.scale_tril)
+        if isinstance(guide, AutoDiagonalNormal):
+            loc, root = posterior.base_dist.loc, torch.diag(posterior.base_dist.scale)
+        else:
+            loc, root = posterior.loc, posterior.scale_tril
+        fitted = Mixture.normal(potential, loc, root)
     return VariationalPosterior(fitted, trained.elbo, trained.message)
 
 
@@ -135,37 +141,3 @@ def log_weights(potential: Potential, centre: Tensor, root: Tensor, seed: int) -
     energies = potential.with_jacobian((centre + x @ root.mT).numpy())[0]
     log_q = -0.5 * (x.square() + math.log(2.0 * math.pi)).sum(1) - root.diagonal().log().sum()
     return -torch.tensor(energies) - log_q
-
-
-def _independent(
-    potential: Potential,
-    steps: int,
-    particles: int,
-    learning_rate: float,
-    seed: int,
-    checkpoints: Checkpoints,
-    key: str,
-    progress: bool,
-) -> VariationalPosterior:
-    """A normal with diagonal covariance, narrow at first: ridges are thin."""
-    values = {name: v.detach() for name, v in potential.at.items()}
-    guide = AutoDiagonalNormal(
-        potential.model, init_loc_fn=init_to_value(values=values), init_scale=0.003
-    )
-    loss = Trace_ELBO(num_particles=particles, vectorize_particles=True, max_plate_nesting=0)
-    with pyro.get_param_store().scope(), pyro.validation_enabled(False):
-        trained = train(
-            potential.model,
-            guide,
-            potential.args,
-            loss,
-            steps=steps,
-            learning_rate=0.2 * learning_rate,
-            seed=seed,
-            checkpoints=checkpoints,
-            progress=progress,
-            key=f"{key}-svi",
-        )
-        posterior = guide.get_posterior().base_dist
-        fitted = Mixture.normal(potential, posterior.loc, torch.diag(posterior.scale))
-    return VariationalPosterior(fitted, trained.elbo, trained.message)

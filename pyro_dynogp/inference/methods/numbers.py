@@ -40,8 +40,6 @@ RISE, NEWS, SHARE = 60.0, 0.3, 0.1
 ITERATIONS = 30
 # Gradient, in coordinates that are round at the fitted number, at which they are there.
 FLAT = 0.05
-# Standard deviation of an unconstrained site in whose direction the density is flat.
-WIDEST = 3.0
 # Negative log densities, up to a constant, of several values of the number or numbers; infinite
 # where they cannot be evaluated. Several at once cost little more than one.
 Energies = Callable[[Sequence[tuple[float, ...]]], np.ndarray]
@@ -81,7 +79,7 @@ def number_posterior(
     steps = np.array([one.step for one in numbers])
     first = potential(centre)
     z = first.pack(first.at).numpy()
-    root = bounded_root(first.hessian(z), widest=WIDEST)
+    root = bounded_root(first.hessian(z))
     known: dict[tuple[float, ...], tuple[float, np.ndarray]] = {}
 
     def energies(many: Sequence[tuple[float, ...]]) -> np.ndarray:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pyro
@@ -14,7 +13,6 @@ from pyro.infer import MCMC, NUTS
 from pyro.ops.stats import effective_sample_size, split_gelman_rubin
 from torch import Tensor
 
-from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.cascade_coordinates import potential_for_sampling
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.methods.base import Problem
@@ -22,7 +20,9 @@ from pyro_dynogp.inference.methods.mode import best_optima, check_optimizer
 from pyro_dynogp.inference.optimise.maximum import Optimizer
 from pyro_dynogp.inference.posteriors import Sampled
 from pyro_dynogp.inference.run import Run, at_least_one
+from pyro_dynogp.layers.sites import Program
 from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.prepared import Records
 from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import child_seeds, parallel_map, seeded
 
@@ -71,7 +71,8 @@ class Nuts:
         check_optimizer(self.optimizer)
 
     def check(self, model: Model, *, warm: bool) -> None:
-        """Every model can be sampled."""
+        """Every model can be sampled; not every optimizer finds its mode."""
+        check_optimizer(self.optimizer, model)
 
     @property
     def identity(self) -> object:
@@ -85,14 +86,12 @@ class Nuts:
         best = optima[0]
         chain = sample_posterior(
             problem.target,
-            problem.argument,
+            problem.records,
             best.values,
+            run,
             chains=self.chains,
             draws=self.draws,
             warmup=self.warmup,
-            seed=run.seed,
-            workers=run.workers,
-            progress=run.progress,
         )
         diagnostics = {"divergences": float(chain.divergences), "chains": float(self.chains),
                        "warmup": float(self.warmup)}  # fmt: skip
@@ -101,23 +100,16 @@ class Nuts:
         for site, values in chain.effective_samples.items():
             diagnostics[f"effective samples {site}"] = float(values.min())
         draws = FrozenMapping({k: v.flatten(0, 1) for k, v in chain.draws.items()})
-        return Fitted(
-            model=problem.model,
-            posterior=Sampled(draws),
-            draws=draws,
-            mode=FrozenMapping(best.values),
-            history=best.history,
-            start_energies=np.array([optimum.energy for optimum in optima]),
-            diagnostics=FrozenMapping(diagnostics),
-            seed=run.seed,
-            records=problem.records,
+        energies = [optimum.energy for optimum in optima]
+        return problem.fitted(
+            run, Sampled(draws), draws, best.values, best.history, energies, diagnostics
         )
 
 
 @dataclass(frozen=True)
 class _Task:
-    model: Any
-    records: Record | Sequence[Record]
+    model: Program
+    records: Records
     values: dict[str, Tensor]
     centre: np.ndarray
     root: np.ndarray
@@ -182,17 +174,15 @@ def within_reach(energy: Callable[[dict[str, Tensor]], Tensor], start: Tensor) -
 
 
 def sample_posterior(
-    model: Any,
-    records: Record | Sequence[Record],
+    model: Program,
+    records: Records,
     values: dict[str, Tensor],
+    run: Run,
     *,
     chains: int = 4,
     draws: int = 500,
     warmup: int = 500,
     target_accept: float = 0.8,
-    seed: int = 0,
-    workers: int | None = None,
-    progress: bool = False,
 ) -> Chains:
     """Run NUTS from around the posterior mode `values`.
 
@@ -202,7 +192,7 @@ def sample_posterior(
     (`within_reach`).
     """
     potential = potential_for_sampling(model, (records,), values)
-    z, root = potential.laplace(values, widest=3.0)
+    z, root = potential.laplace(values)
     tasks = [
         _Task(
             model,
@@ -214,11 +204,11 @@ def sample_posterior(
             warmup,
             target_accept,
             child,
-            progress and i == 0,
+            run.progress and i == 0,
         )
-        for i, child in enumerate(child_seeds(seed, chains))
+        for i, child in enumerate(child_seeds(run.seed, chains))
     ]
-    results = parallel_map(_run_chain, tasks, workers=workers)
+    results = parallel_map(_run_chain, tasks, workers=run.workers)
     drawn = torch.stack([x for x, _ in results])
     with torch.no_grad():
         sites = {k: v.contiguous() for k, v in potential.unpack(drawn).items()}

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 import numpy as np
 import pyro
@@ -17,24 +17,22 @@ from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.mode import best_optima, check_optimizer
 from pyro_dynogp.inference.methods.normal import VariationalPosterior, variational
+from pyro_dynogp.inference.methods.svi import Schedule
 from pyro_dynogp.inference.optimise.maximum import Optimizer, Optimum
 from pyro_dynogp.inference.posteriors import Mixture, draws_of_guide
 from pyro_dynogp.inference.run import Run, at_least_one
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.support.checkpoints import Checkpoints, Piece
+from pyro_dynogp.support.checkpoints import Piece
 from pyro_dynogp.support.errors import invalid
-from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import parallel_map, seeded
 
+Values = dict[str, Tensor]
 Hyperparameters = Literal["map", "normal", "multivariate normal"]
 
 # Optima that a posterior can consist of.
 MOST_OPTIMA = 4
 # Least weight of one that counts.
 LEAST_WEIGHT = 0.05
-# Largest standard deviation of a direction in the evidence of an optimum (unconstrained units):
-# about twice that of the priors.
-WIDEST = 3.0
 # Iterations of SVI around optima that are found already.
 POLISH = 60
 
@@ -92,7 +90,8 @@ class Normal:
         check_optimizer(self.optimizer)
 
     def check(self, model: Model, *, warm: bool) -> None:
-        """Refuse "map" for a model in which nothing would be free."""
+        """Refuse "map" for a model in which nothing would be free, and unsuitable optimizers."""
+        check_optimizer(self.optimizer, model)
         if self.family == "map" and not model.has_function and not model.collapsed.state_sites:
             raise invalid(
                 "hyperparameters",
@@ -119,15 +118,13 @@ class Normal:
         family = self.family_for(model)
         steps = run.steps or (POLISH if model.has_function else 1000)
         found = posterior_of(
-            problem.target,
-            problem.argument,
+            problem,
             optima,
             family,
-            free=free_sites(problem),
-            steps=min(steps, POLISH) if family == "map" else steps,
-            particles=self.particles,
-            learning_rate=self.learning_rate,
-            run=run,
+            run,
+            Schedule(
+                min(steps, POLISH) if family == "map" else steps, self.particles, self.learning_rate
+            ),
         )
         with seeded(run.seed):
             drawn = draws_of_guide(found.guide, self.draws)
@@ -137,69 +134,53 @@ class Normal:
             "elbo_sd": float(tail.std()),
             "optima": float(found.optima),
         }
-        return Fitted(
-            model=model,
-            posterior=found.guide,
-            draws=FrozenMapping({name: drawn[name] for name in found.mode}),
-            mode=FrozenMapping(found.mode),
-            history=found.elbo,
-            start_energies=np.array([optimum.energy for optimum in optima]),
-            diagnostics=FrozenMapping(diagnostics),
-            seed=run.seed,
-            records=problem.records,
+        draws = {name: drawn[name] for name in found.mode}
+        energies = [optimum.energy for optimum in optima]
+        return problem.fitted(
+            run, found.guide, draws, found.mode, found.elbo, energies, diagnostics
         )
 
 
 def free_sites(problem: Problem) -> list[str]:
     """Names of inducing values and first states."""
-    assert problem.model.scaling is not None
-    sites = problem.target.all_sites(problem.model.scaling, len(problem.records))
+    sites = problem.target.all_sites(problem.scaling, len(problem.records))
     return [site.name for site in sites if site.role == "free"]
 
 
 @dataclass(frozen=True)
-class _Task:
-    target: Any
-    argument: Any
-    fixed: Mapping[str, Tensor]
-    free: dict[str, Tensor]
-    options: Mapping[str, Any]
+class _Around:
+    """One optimum of a problem; of the sites some stay at it, others are free."""
 
-
-def _around(task: _Task) -> VariationalPosterior:
-    conditioned = pyro.poutine.condition(task.target, data=dict(task.fixed))
-    return variational(conditioned, (task.argument,), task.free, **task.options)
-
-
-@dataclass(frozen=True)
-class _Place:
-    target: Any
-    argument: Any
-    values: dict[str, Tensor]
-    checkpoints: Checkpoints
+    problem: Problem
+    run: Run
+    fixed: Values
+    free: Values
     key: str
+    schedule: Schedule
 
+    def posterior(self) -> VariationalPosterior:
+        """The normal of the free sites."""
+        conditioned = pyro.poutine.condition(self.problem.target, data=self.fixed)
+        args = (self.problem.records,)
+        return variational(conditioned, args, self.free, self.run, self.schedule, key=self.key)
 
-def _evidence(task: _Place) -> float:
-    def find() -> Piece:
-        potential = Potential(task.target, (task.argument,), task.values)
-        found = potential.log_evidence(task.values, widest=WIDEST)
-        return {"evidence": torch.tensor(found, dtype=torch.float64)}
+    def evidence(self) -> float:
+        """Laplace's approximation of log p(y) [nats]; all sites are free."""
 
-    return float(task.checkpoints.piece(task.key, find)["evidence"])
+        def compute() -> Piece:
+            potential = Potential(self.problem.target, (self.problem.records,), self.free)
+            found = potential.log_evidence(self.free)
+            return {"evidence": torch.tensor(found, dtype=torch.float64)}
+
+        return float(self.run.checkpoints.piece(self.key, compute)["evidence"])
 
 
 def posterior_of(
-    target: Any,
-    argument: Any,
+    problem: Problem,
     optima: Sequence[Optimum],
     family: Hyperparameters,
-    *,
-    free: Sequence[str],
-    steps: int,
-    particles: int = 8,
-    learning_rate: float = 0.02,
     run: Run,
+    schedule: Schedule,
 ) -> Variational:
     """Fit the posterior by SVI, from the optima.
 
@@ -211,74 +192,61 @@ def posterior_of(
     exp(evidence), which would keep one whatever the rest is.
 
     Args:
-        target: Pyro model. argument: what it is called with. optima: the best first.
-        family: of the posterior. free: names of the sites that vary with "map".
-        steps, particles, learning_rate: of SVI. run: seed, processes and so on.
+        problem: model and records. optima: the best first. family: of the posterior.
+        run: seed, processes and so on. schedule: of SVI.
     """
-    options: dict[str, Any] = {
-        "steps": steps,
-        "particles": particles,
-        "learning_rate": learning_rate,
-        "seed": run.seed,
-        "checkpoints": run.checkpoints,
-    }
     if family != "map":
-        independent = family == "normal"
         best = optima[0].values
         found = variational(
-            target,
-            (argument,),
+            problem.target,
+            (problem.records,),
             dict(best),
-            independent=independent,
-            progress=run.progress,
-            **options,
+            run,
+            schedule,
+            independent=family == "normal",
         )
         return Variational(found.guide, best, found.elbo, 1)
-    leading, weights = _weighted(target, argument, optima, run)
-    tasks = []
-    for index, values in enumerate(leading):
-        moving = {k: v for k, v in values.items() if k in free}
-        fixed = {k: v for k, v in values.items() if k not in free}
-        own = {
-            **options,
-            "key": f"posterior-{index}",
-            "progress": run.progress and len(leading) == 1,
-        }
-        tasks.append(_Task(target, argument, fixed, moving, own))
-    found_all = parallel_map(
-        _around,
+    leading, weights = _weighted(problem, optima, run)
+    free = free_sites(problem)
+    each = replace(run, progress=run.progress and len(leading) == 1)
+    tasks = [
+        _Around(
+            problem,
+            each,
+            {k: v for k, v in values.items() if k not in free},
+            {k: v for k, v in values.items() if k in free},
+            f"posterior-{index}",
+            schedule,
+        )
+        for index, values in enumerate(leading)
+    ]
+    normals = parallel_map(
+        _Around.posterior,
         tasks,
         workers=run.workers,
         progress=run.progress and len(tasks) > 1,
         description="posterior",
-        news=lambda found: f"elbo {max(level(one) for one in found):.2f}",
+        news=lambda done: f"elbo {max(level(normal) for normal in done):.2f}",
     )
-    guide = Mixture.of(
-        weights, [task.fixed for task in tasks], [found.guide for found in found_all]
-    )
-    return Variational(guide, leading[0], found_all[0].elbo, len(tasks))
+    guide = Mixture.of(weights, [task.fixed for task in tasks], [n.guide for n in normals])
+    return Variational(guide, leading[0], normals[0].elbo, len(tasks))
 
 
-def _weighted(
-    target: Any,
-    argument: Any,
-    optima: Sequence[Optimum],
-    run: Run,
-) -> tuple[list[dict[str, Tensor]], Tensor]:
+def _weighted(problem: Problem, optima: Sequence[Optimum], run: Run) -> tuple[list[Values], Tensor]:
     """Values at the optima that carry weight, the weightiest first, and their weights."""
-    leading = [one.values for one in optima[:MOST_OPTIMA]]
+    leading = [optimum.values for optimum in optima[:MOST_OPTIMA]]
     if len(leading) == 1:
         return leading, torch.ones(1, dtype=torch.float64)
     evidences = parallel_map(
-        _evidence,
+        _Around.evidence,
         [
-            _Place(target, argument, values, run.checkpoints, f"evidence-{index}")
+            _Around(problem, run, {}, values, f"evidence-{index}", Schedule())
             for index, values in enumerate(leading)
         ],
         workers=run.workers,
         progress=run.progress,
         description="evidence",
-        news=lambda found: f"log evidence {max(found):.2f}",
+        news=lambda done: f"log evidence {max(done):.2f}",
     )
     levels = torch.tensor(evidences, dtype=torch.float64)
     weights, order = torch.softmax(levels / spread(leading[0]), 0).sort(descending=True)

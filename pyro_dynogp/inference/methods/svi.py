@@ -17,7 +17,9 @@ from pyro.poutine.runtime import _PYRO_PARAM_STORE
 from torch import Tensor
 from tqdm import tqdm
 
-from pyro_dynogp.support.checkpoints import Checkpoints, Piece
+from pyro_dynogp.inference.run import Run
+from pyro_dynogp.layers.sites import Arguments, Program
+from pyro_dynogp.support.checkpoints import Piece
 from pyro_dynogp.support.parallel import seeded
 
 # Steps without a rise after which training ends.
@@ -55,6 +57,19 @@ class TrainingDivergedError(ValueError):
 
 
 @dataclass(frozen=True)
+class Schedule:
+    """How long and how finely SVI trains.
+
+    Attributes:
+        steps: most of them. particles: draws of a step. learning_rate: the first one.
+    """
+
+    steps: int = 1000
+    particles: int = 8
+    learning_rate: float = 0.02
+
+
+@dataclass(frozen=True)
 class Trained:
     """Result of `train`.
 
@@ -70,16 +85,13 @@ class Trained:
 
 
 def train(
-    model: Callable[..., Any],
-    guide: Callable[..., Any],
-    args: tuple[Any, ...],
+    model: Program,
+    guide: Program,
+    args: Arguments,
     loss: Any,
+    run: Run,
+    schedule: Schedule,
     *,
-    steps: int,
-    learning_rate: float,
-    seed: int,
-    checkpoints: Checkpoints,
-    progress: bool,
     key: str = "svi",
     rise: float = 0.05,
     layers: Mapping[str, str] = MappingProxyType({}),
@@ -96,7 +108,8 @@ def train(
         TrainingDivergedError: where the ELBO is not a number or cannot be computed; it names the
             parameters concerned and holds the last good state.
     """
-    settings = {"lr": learning_rate, "lrd": 0.1 ** (1.0 / steps), "clip_norm": 10.0}
+    steps = schedule.steps
+    settings = {"lr": schedule.learning_rate, "lrd": 0.1 ** (1.0 / steps), "clip_norm": 10.0}
     optimizer = ClippedAdam(settings)
     svi = SVI(model, guide, optimizer, loss)
     elbo: list[float] = []
@@ -104,7 +117,7 @@ def train(
     live = True  # whether store and optimiser are where `state` says
     best, best_step = -np.inf, 0
     message = "all steps used"
-    with tqdm(total=steps, desc=key, disable=not progress) as bar, seeded(seed):
+    with tqdm(total=steps, desc=key, disable=not run.progress) as bar, seeded(run.seed):
         while len(elbo) < steps:
             first, count = len(elbo), min(CHUNK, steps - len(elbo))
             before, ready = state, live
@@ -120,7 +133,7 @@ def train(
                 live = True
                 return {**_state(optimizer), "elbo": torch.tensor(values, dtype=torch.float64)}
 
-            state = checkpoints.piece(f"{key}-{first + count:07d}", advance)
+            state = run.checkpoints.piece(f"{key}-{first + count:07d}", advance)
             elbo.extend(state["elbo"].tolist())
             bar.update(count)
             smoothed = float(np.mean(elbo[-CHUNK:]))
@@ -138,7 +151,7 @@ def train(
 
 def _step(
     svi: SVI,
-    args: Any,
+    args: Arguments,
     step: int,
     state: Piece | None,
     elbo: list[float],
@@ -165,7 +178,7 @@ def _diverged(
     elbo: list[float],
     before: Mapping[str, Tensor],
     svi: SVI,
-    args: Any,
+    args: Arguments,
     layers: Mapping[str, str],
 ) -> TrainingDivergedError:
     good = before if all(bool(torch.isfinite(p).all()) for p in before.values()) else {}
@@ -194,7 +207,7 @@ def _of(site: str, layer: str) -> bool:
     return any(part == layer or part.startswith(f"{layer}_") for part in site.split("."))
 
 
-def _broken_sites(svi: SVI, args: Any) -> list[str]:
+def _broken_sites(svi: SVI, args: Arguments) -> list[str]:
     """Sites whose value or density is not finite, or cannot be computed, in one run."""
     guide = pyro.poutine.trace(svi.guide)
     with torch.no_grad(), pyro.validation_enabled(False):

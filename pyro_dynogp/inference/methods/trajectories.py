@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pyro
@@ -13,11 +13,10 @@ import torch
 from pyro.infer import Trace_ELBO, TraceMeanField_ELBO
 from torch import Tensor
 
-from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.mode import starting_points
-from pyro_dynogp.inference.methods.svi import Trained, train
+from pyro_dynogp.inference.methods.svi import Schedule, Trained, train
 from pyro_dynogp.inference.methods.trajectory_guide import (
     GuideChoice,
     identity_of,
@@ -28,8 +27,10 @@ from pyro_dynogp.inference.methods.trajectory_guide import (
 )
 from pyro_dynogp.inference.posteriors import Sampled
 from pyro_dynogp.inference.run import Run, at_least_one
+from pyro_dynogp.layers.sites import Arguments, Program
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.support.checkpoints import Checkpoints, Piece
+from pyro_dynogp.models.prepared import PreparedRecord
+from pyro_dynogp.support.checkpoints import Piece
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import child_seeds, parallel_map, seeded
@@ -40,14 +41,12 @@ Values = dict[str, Tensor]
 @dataclass(frozen=True)
 class _Task:
     model: Model
-    records: Record | tuple[Record, ...]
+    records: tuple[PreparedRecord, ...]
     method: Trajectories
     values: Values
-    steps: int
-    seed: int
+    run: Run
+    schedule: Schedule
     key: str
-    checkpoints: Checkpoints
-    progress: bool
 
 
 def _run(task: _Task) -> Piece:
@@ -58,48 +57,43 @@ def _run(task: _Task) -> Piece:
         with pyro.get_param_store().scope(), pyro.validation_enabled(False):
             method = task.method
             own = callable(method.guide) and not isinstance(method.guide, Mapping)
-            guide: Any
-            through: Callable[..., Any]
+            guide: Program
+            through: Program
             if own:
                 # A `LayerGuide` remembers the sites of its first call.
-                guide = copy.deepcopy(method.guide)
+                guide = copy.deepcopy(cast(Program, method.guide))
                 through = guide
-                loss: Any = Trace_ELBO(num_particles=method.particles)
+                loss: Any = Trace_ELBO(num_particles=task.schedule.particles)
             else:
-                n = max(len(r) for r in _several(task.records))
+                n = max(len(r) for r in task.records)
                 guide = layer_guide(task.model, method.guide, task.values, n)
                 through = guide.single_pass()
                 loss = TraceMeanField_ELBO(
-                    num_particles=method.particles, vectorize_particles=True, max_plate_nesting=0
+                    num_particles=task.schedule.particles,
+                    vectorize_particles=True,
+                    max_plate_nesting=0,
                 )
             trained = train(
                 task.model,
                 through,
                 args,
                 loss,
-                steps=task.steps,
-                learning_rate=method.learning_rate,
-                seed=task.seed,
-                checkpoints=task.checkpoints,
-                progress=task.progress,
+                task.run,
+                task.schedule,
                 key=task.key,
                 rise=0.5,
-                layers={one.name: one.described for one in task.model.wires},
+                layers={place.name: place.described for place in task.model.wires},
             )
-            with seeded(task.seed):
+            with seeded(task.run.seed):
                 draws, log_q = _draw(guide, args, method.draws, vectorised=not own)
         return _pack(trained, draws, log_q)
 
-    return task.checkpoints.piece(f"{task.key}-result", compute)
+    return task.run.checkpoints.piece(f"{task.key}-result", compute)
 
 
 def _level(piece: Piece) -> float:
     """ELBO over the last steps."""
     return float(piece["elbo"][-50:].mean())
-
-
-def _several(records: Record | tuple[Record, ...]) -> tuple[Record, ...]:
-    return (records,) if isinstance(records, Record) else records
 
 
 def _pack(trained: Trained, draws: Values, log_q: Values) -> Piece:
@@ -111,7 +105,7 @@ def _pack(trained: Trained, draws: Values, log_q: Values) -> Piece:
 
 
 def _draw(
-    guide: Callable[..., Any], args: Any, count: int, *, vectorised: bool
+    guide: Program, args: Arguments, count: int, *, vectorised: bool
 ) -> tuple[Values, Values]:
     """Draws (S, *shape) of every latent site, and the log-density (S,) of every site's draws."""
 
@@ -128,7 +122,7 @@ def _draw(
         return own, {name: site["log_prob"] for name, site in sites.items()}
 
     def stack(traces: Sequence[Values]) -> Values:
-        return {name: torch.stack([one[name] for one in traces]) for name in traces[0]}
+        return {name: torch.stack([trace[name] for trace in traces]) for name in traces[0]}
 
     with torch.no_grad():
         if vectorised:
@@ -136,7 +130,7 @@ def _draw(
                 draws, log_q = latent(pyro.poutine.trace(guide).get_trace(*args))
             return draws, {k: v.expand(count) for k, v in log_q.items()}
         traces = [latent(pyro.poutine.trace(guide).get_trace(*args)) for _ in range(count)]
-    log_q = stack([{k: v.sum() for k, v in one.items()} for _, one in traces])
+    log_q = stack([{k: v.sum() for k, v in densities.items()} for _, densities in traces])
     return stack([own for own, _ in traces]), log_q
 
 
@@ -218,16 +212,14 @@ class Trajectories:
         log_q = {k[len("log_q/") :]: v for k, v in best.items() if k.startswith("log_q/")}
         others = {k: v for k, v in sampled.items() if k not in kept}
         draws = FrozenMapping(kept)
-        return Fitted(
-            model=problem.model,
-            posterior=Sampled(draws, "svi", FrozenMapping(others), FrozenMapping(log_q)),
-            draws=draws,
-            mode=FrozenMapping({k: v.median(0).values for k, v in kept.items()}),
-            history=elbo,
-            start_energies=-np.array(levels)[order],
-            diagnostics=FrozenMapping({"elbo": float(tail.mean()), "elbo_sd": float(tail.std())}),
-            seed=run.seed,
-            records=problem.records,
+        return problem.fitted(
+            run,
+            Sampled(draws, "svi", FrozenMapping(others), FrozenMapping(log_q)),
+            draws,
+            {k: v.median(0).values for k, v in kept.items()},
+            elbo,
+            -np.array(levels)[order],
+            {"elbo": float(tail.mean()), "elbo_sd": float(tail.std())},
         )
 
     def _trained(self, problem: Problem, run: Run) -> list[Piece]:
@@ -236,22 +228,17 @@ class Trajectories:
         target = self._target(problem.model)
         points: list[Values] = [{}] * restarts
         if not self._written:
-            found = starting_points(
-                target, problem.records, restarts, steps, run.seed, run.workers, run.progress,
-                run.checkpoints,
-            )  # fmt: skip
+            found = starting_points(target, problem.records, run, count=restarts, steps=steps)
             points = [{**v, **starting_trajectories(target, problem.records, v)} for v in found]
         tasks = [
             _Task(
                 target,
-                problem.argument,
+                problem.records,
                 self,
                 point,
-                steps,
-                seed,
+                replace(run, seed=seed, progress=run.progress and run.workers == 1),
+                Schedule(steps, self.particles, self.learning_rate),
                 f"start-{index}",
-                run.checkpoints,
-                run.progress and run.workers == 1,
             )
             for index, (point, seed) in enumerate(
                 zip(points, child_seeds(run.seed, restarts), strict=True)

@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pyro_dynogp.data.record import Record
 from pyro_dynogp.guides.families import (
     Family,
     FullRank,
@@ -22,6 +21,7 @@ from pyro_dynogp.guides.layer_guide import LayerGuide
 from pyro_dynogp.layers.noise import Gaussian
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.outputs import output_process
+from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.models.wiring import Dynamic
 from pyro_dynogp.support.errors import invalid
 
@@ -64,12 +64,12 @@ def layer_guide(model: Model, choice: Any, values: Mapping[str, Tensor], n: int)
             "Pyro function",
             got=repr(choice),
         )
-    statics = {one.name for one in model.wires if not isinstance(one.layer, Dynamic)}
+    statics = {place.name for place in model.wires if not isinstance(place.layer, Dynamic)}
 
     def family(name: str, prior: Any) -> Family:
         base, _, number = name.rpartition("_")
         layer = base if number.isdigit() else name
-        if any(layer == one.name for one in model.wires if isinstance(one.layer, Dynamic)):
+        if any(layer == place.name for place in model.wires if isinstance(place.layer, Dynamic)):
             return kinds[kind]
         if layer in statics or (name.endswith("_residual") and base in statics):
             return SameAsPrior()
@@ -80,22 +80,23 @@ def layer_guide(model: Model, choice: Any, values: Mapping[str, Tensor], n: int)
     return LayerGuide(model, chosen, family, values=values)
 
 
-def starting_trajectories(model: Model, records: Sequence[Record], values: Values) -> Values:
+def starting_trajectories(
+    model: Model, records: Sequence[PreparedRecord], values: Values
+) -> Values:
     """First trajectories of the dynamic layers: smoothed by the moment-matching filter."""
-    assert model.scaling is not None
     out: Values = {}
     for index, record in enumerate(records):
         suffix = "" if len(records) == 1 else f"_{index}"
         with torch.no_grad():
-            system = model.collapsed.system(values, model.scaling)
+            system = model.collapsed.system(values, record.scaling)
             system = model.begin(system, model.states_of(values, suffix))
-            outputs = output_process(system, model.scaling, record)
-            found = outputs.smooth(record.tensors().observations)
-        for one in model.wires:
-            integrated = one.last and model.integrate == "last"
-            if isinstance(one.layer, Dynamic) and not integrated:
-                path = torch.tensor(found[one.name].mean[0])
-                out[one.name + suffix] = path if one.layer.outputs > 1 else path[:, 0]
+            outputs = output_process(system, record)
+            found = outputs.smooth(record.observations)
+        for place in model.wires:
+            integrated = place.last and model.integrate == "last"
+            if isinstance(place.layer, Dynamic) and not integrated:
+                path = torch.tensor(found[place.name].mean[0])
+                out[place.name + suffix] = path if place.layer.outputs > 1 else path[:, 0]
     return out
 
 
@@ -114,7 +115,7 @@ def identity_of(guide: GuideChoice) -> object:
     return (named.__module__, named.__qualname__, body)
 
 
-def parameter_sites(model: Model, records: Sequence[Record]) -> list[str]:
+def parameter_sites(model: Model, records: Sequence[PreparedRecord]) -> list[str]:
     """Names of the sites that the collapsed model has."""
-    assert model.scaling is not None
-    return [site.name for site in model.collapsed.all_sites(model.scaling, len(records))]
+    sites = model.collapsed.all_sites(records[0].scaling, len(records))
+    return [site.name for site in sites]

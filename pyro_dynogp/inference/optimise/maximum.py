@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -11,26 +12,29 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pyro_dynogp.data.record import Record
-from pyro_dynogp.data.records import as_records
 from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.optimise import gauss_newton
 from pyro_dynogp.inference.optimise.descent import descend, lbfgs
 from pyro_dynogp.inference.optimise.lockstep import Functions, in_lockstep
-from pyro_dynogp.support.checkpoints import (
-    NOTHING_KEPT,
-    Checkpoints,
-    Piece,
-    tensor_text,
-    text_tensor,
-)
+from pyro_dynogp.inference.run import Run
+from pyro_dynogp.layers.sites import Program
+from pyro_dynogp.models.prepared import Records, as_measured
+from pyro_dynogp.support.checkpoints import Piece, tensor_text, text_tensor
 from pyro_dynogp.support.parallel import parallel_map, seeded
 
-Optimizer = Literal["lbfgs", "preconditioned", "adam"]
+# End, energies on the way, why it ended.
+Climb = tuple[np.ndarray, list[float], str]
+Optimizer = Literal["gauss-newton", "lbfgs", "preconditioned", "adam"]
 # Adam's first step, and how often it goes back to the best point with a shorter one.
 RATE, RETURNS = 0.02, 2
 # Starts that climb together, as long as they have no more samples than this in all: longer records
 # keep a processor busy one by one.
 TOGETHER, BATCH_SAMPLES = 4, 8000
+
+
+# Iterations of Gauss-Newton after which starts are ranked, and the share of them that goes on:
+# those from subspace identification rise first, others may end higher.
+RANKED = ((5, 0.75), (15, 0.5), (30, 0.5))
 
 
 @dataclass(frozen=True)
@@ -75,36 +79,29 @@ class Optimum:
 class _Task:
     """Starts that climb together; `goes_on` says that they have climbed already."""
 
-    model: Any
-    records: Record | Sequence[Record]
+    model: Program
+    records: Records
     starts: tuple[dict[str, Tensor], ...]
     optimizer: Optimizer
     steps: int
-    seed: int
-    checkpoints: Checkpoints
+    run: Run
     key: str
     rate: float
     goes_on: bool
 
 
-def _lbfgs(
-    functions: Functions, z: np.ndarray, task: _Task, every: int
-) -> tuple[np.ndarray, list, str]:
+def _lbfgs(functions: Functions, z: np.ndarray, task: _Task, every: int) -> Climb:
     del every  # of Hessians, of which it has none
     history: list[float] = []
     result = lbfgs(functions, z, task.steps, history, maxfun=2 * task.steps, ftol=1e-7)
     return result.x, history, str(result.message)
 
 
-def _preconditioned(
-    functions: Functions, z: np.ndarray, task: _Task, every: int
-) -> tuple[np.ndarray, list, str]:
+def _preconditioned(functions: Functions, z: np.ndarray, task: _Task, every: int) -> Climb:
     return descend(functions, z, task.steps, every=every, first=0 if task.goes_on else None)
 
 
-def _adam(
-    functions: Functions, z: np.ndarray, task: _Task, every: int
-) -> tuple[np.ndarray, list, str]:
+def _adam(functions: Functions, z: np.ndarray, task: _Task, every: int) -> Climb:
     """Adam with a falling step; back to the best point with a shorter one where it got lost.
 
     Its first steps have full length in every direction, however good the start is.
@@ -150,26 +147,33 @@ _METHODS = {"lbfgs": _lbfgs, "preconditioned": _preconditioned, "adam": _adam}
 
 
 def _optimise(task: _Task) -> list[Optimum]:
-    return _unpack(task.checkpoints.piece(task.key, lambda: _pack(_climb(task))))
+    return _unpack(task.run.checkpoints.piece(task.key, lambda: _pack(_climb(task))))
 
 
 def _climb(task: _Task) -> list[Optimum]:
-    with seeded(task.seed):
+    with seeded(task.run.seed):
         potential = Potential(task.model, (task.records,), task.starts[0])
-        method = _METHODS[task.optimizer]
-        every = potential.hessian_cost  # of a climb, Hessians are at most half the work
-
-        def run(start: dict[str, Tensor]) -> Callable[[Functions], tuple[np.ndarray, list, str]]:
-            z = potential.pack(start).numpy()
-            return lambda functions: method(functions, z, task, every)
-
-        found = in_lockstep(potential.values_and_gradients, [run(start) for start in task.starts])
+        found = _climbs(potential, task)
         ends = np.stack([z for z, _, _ in found])
         energies = potential.values_and_gradients(ends)[0]
         return [
             Optimum(float(energy), _values(potential, z), np.asarray(history), message)
             for energy, (z, history, message) in zip(energies, found, strict=True)
         ]
+
+
+def _climbs(potential: Potential, task: _Task) -> list[Climb]:
+    starts = [potential.pack(start).numpy() for start in task.starts]
+    if task.optimizer == "gauss-newton":
+        innovations = gauss_newton.Innovations(potential)
+        return [gauss_newton.climb(innovations, z, task.steps) for z in starts]
+    method = _METHODS[task.optimizer]
+    every = potential.hessian_cost  # of a climb, Hessians are at most half the work
+
+    def run(z: np.ndarray) -> Callable[[Functions], Climb]:
+        return lambda functions: method(functions, z, task, every)
+
+    return in_lockstep(potential.values_and_gradients, [run(z) for z in starts])
 
 
 def _values(potential: Potential, z: np.ndarray) -> dict[str, Tensor]:
@@ -199,12 +203,12 @@ def _unpack(piece: Piece) -> list[Optimum]:
 
 def _batches(
     starts: Sequence[dict[str, Tensor]],
-    model: Any,
-    records: Record | Sequence[Record],
+    model: Program,
+    records: Records,
     together: int,
 ) -> list[tuple[dict[str, Tensor], ...]]:
     """Starts in batches of nearly one size."""
-    outputs = sum(len(one) * max(one.n_outputs, 1) for one in as_records(records))
+    outputs = sum(len(one) * max(one.n_outputs, 1) for one in as_measured(records))
     pays = BATCH_SAMPLES // outputs if getattr(model, "takes_batches", False) else 1
     count = -(-len(starts) // max(1, min(together, pays)))
     edges = np.linspace(0, len(starts), count + 1).round().astype(int)
@@ -212,26 +216,25 @@ def _batches(
 
 
 def maximise(
-    model: Any,
-    records: Record | Sequence[Record],
+    model: Program,
+    records: Records,
     starts: Sequence[dict[str, Tensor]],
+    run: Run,
     *,
     optimizer: Optimizer = "lbfgs",
     steps: int = 500,
-    seed: int = 0,
-    workers: int | None = None,
-    progress: bool = False,
-    checkpoints: Checkpoints = NOTHING_KEPT,
     key: str = "optimum",
     effort: Effort = EFFORT,
 ) -> list[Optimum]:
     """Climb from every start; the optima sorted by energy, best first.
 
     All starts get a fifth of the steps, then the best of them the rest (successive halving: a start
-    that is far behind by then hardly ever wins). The mode is that of the density of the constrained
-    values (no Jacobian), as AutoDelta has it. The result does not depend on the number of
-    processors.
+    that is far behind by then hardly ever wins); by Gauss-Newton in the stages of `RANKED`. The
+    mode is that of the density of the constrained values (no Jacobian), as AutoDelta has it. The
+    result does not depend on the number of processors.
     """
+    # Gauss-Newton evaluates several points by itself.
+    together = 1 if optimizer == "gauss-newton" else effort.together
 
     def climb(values: Sequence[dict[str, Tensor]], count: int, label: str) -> list[Optimum]:
         tasks = [
@@ -241,19 +244,18 @@ def maximise(
                 batch,
                 optimizer,
                 count,
-                seed,
-                checkpoints,
+                run,
                 f"{key}-{label}-{i}",
                 effort.rate,
-                effort.near or label == "optima",
+                effort.near or label.startswith("optima"),
             )
-            for i, batch in enumerate(_batches(values, model, records, effort.together))
+            for i, batch in enumerate(_batches(values, model, records, together))
         ]
         found = parallel_map(
             _optimise,
             tasks,
-            workers=workers,
-            progress=progress,
+            workers=run.workers,
+            progress=run.progress,
             description=f"{len(values)} {label}",
             news=lambda done: f"log p {-min(o.energy for batch in done for o in batch):.2f}",
         )
@@ -264,15 +266,25 @@ def maximise(
 
     if len(starts) == 1:
         return climb(starts, steps, "optimum")
-    short = max(1, steps // 5)
-    first = best_first(climb(starts, short, "starts"))
-    if steps <= short:
-        return first
-    cut = max(1, round(effort.kept * len(first)))
-    leading = first[:cut]
-    further = climb([optimum.values for optimum in leading], steps - short, "optima")
-    joined = [
-        replace(after, history=np.concatenate([before.history, after.history]))
-        for before, after in zip(leading, further, strict=True)
-    ]
-    return best_first([*joined, *first[cut:]])
+    behind: list[Optimum] = []
+    (first, _), *further = _stages(optimizer, steps, effort.kept)
+    leading = best_first(climb(starts, first, "starts"))
+    for stage, (count, kept) in enumerate(further):
+        cut = max(1, math.ceil(kept * len(leading) - 0.5))
+        leading, behind = leading[:cut], behind + leading[cut:]
+        label = "optima" if stage == 0 else f"optima-{stage}"
+        goes_on = climb([optimum.values for optimum in leading], count, label)
+        leading = best_first([
+            replace(after, history=np.concatenate([before.history, after.history]))
+            for before, after in zip(leading, goes_on, strict=True)
+        ])  # fmt: skip
+    return best_first([*leading, *behind])
+
+
+def _stages(optimizer: Optimizer, steps: int, kept: float) -> list[tuple[int, float]]:
+    """Steps of each stage, and the share of the starts that takes them, all of them at first."""
+    ranked = RANKED if optimizer == "gauss-newton" else ((max(1, steps // 5), kept),)
+    ends = [min(end, steps) for end, _ in ranked] + [steps]
+    shares = [1.0, *(max(kept, share) for _, share in ranked)]
+    counts = np.diff([0, *ends]).tolist()
+    return [(count, share) for count, share in zip(counts, shares, strict=True) if count]

@@ -8,18 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, TypeGuard, TypeVar
+from typing import Any, TypeGuard, TypeVar, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.data.records import as_records
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.optimise.lockstep import Functions, in_lockstep
 from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.prepared import Records, as_measured
 from pyro_dynogp.support.tensors import as_tensor
 
 Result = TypeVar("Result")
@@ -136,7 +136,7 @@ def _is_scaled(model: Any) -> TypeGuard[Model]:
 
 
 def _records(potential: Potential) -> tuple[Record, ...]:
-    return as_records(potential.args[0])
+    return as_measured(cast(Records, potential.args[0]))
 
 
 def _inputs(potential: Potential, scaling: Scaling) -> list[Tensor]:

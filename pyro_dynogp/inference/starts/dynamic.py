@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.starts.poles import random_poles
 from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.models.priors import TimeScale
 from pyro_dynogp.models.wiring import Dynamic, Wire
 
@@ -119,13 +119,13 @@ class DynamicStart:
             + 0.05,
         }
 
-    def response(self, values: Values, record: Record, x: Tensor) -> Tensor:
+    def response(self, values: Values, record: PreparedRecord, x: Tensor) -> Tensor:
         """Mean trajectory (n, w) of the layer."""
         with torch.no_grad():
             time_scale = TimeScale.of(self.scaling)
             layer = self.model.dynamic_system(self.one, self.layer, values, time_scale)
             silent = x.new_zeros((*x.shape[:-1], self.one.fed))
-            return layer.mean(torch.cat([x, silent], -1), record.time)
+            return layer.mean(torch.cat([x, silent], -1), record.grid)
 
     def scale(self, values: Values, factor: float) -> None:
         """Multiply the layer's output."""

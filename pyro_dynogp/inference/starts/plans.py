@@ -9,16 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.starts.dynamic import DynamicStart, Values
 from pyro_dynogp.inference.starts.static import start_static
 from pyro_dynogp.layers.noise import TYPICAL
-from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.models.architectures import LinearDynamicGP
 from pyro_dynogp.models.assembly import assemble
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.system import DynamicSystem, scaled_inputs, scaled_outputs, see
+from pyro_dynogp.models.prepared import PreparedRecord
+from pyro_dynogp.models.system import DynamicSystem, see
 from pyro_dynogp.models.wiring import INPUTS, Dynamic, Static, Wire
 from pyro_dynogp.moments import filtering, smoothing
 from pyro_dynogp.support.parallel import child_seeds
@@ -97,7 +96,7 @@ def plans(
     return out
 
 
-def starting_point(model: Model, records: Sequence[Record], scaling: Scaling, plan: Plan) -> Values:
+def starting_point(model: Model, records: Sequence[PreparedRecord], plan: Plan) -> Values:
     """Values of every site of a cascade, layer by layer along the mean trajectories.
 
     The leading layer is the linear fit, other dynamic layers pass their input on with small random
@@ -107,12 +106,13 @@ def starting_point(model: Model, records: Sequence[Record], scaling: Scaling, pl
     """
     generator = np.random.default_rng(plan.seed)
     values: Values = {}
-    inputs = [scaled_inputs(scaling, record) for record in records]
+    scaling = records[0].scaling
+    inputs = [record.scaled_inputs for record in records]
     driving = model.inputs - model.direct
     signals = [{INPUTS: u[:, :driving]} for u in inputs]
     if model.direct:
         values["direct"] = _direct(model, plan)
-    targets = [scaled_outputs(scaling, record) for record in records]
+    targets = [record.scaled_outputs for record in records]
     if model.direct:
         added = [u[:, driving:] @ values["direct"].mT for u in inputs]
         targets = [y - a for y, a in zip(targets, added, strict=True)]
@@ -164,7 +164,7 @@ def starting_point(model: Model, records: Sequence[Record], scaling: Scaling, pl
             assert isinstance(one.layer, Dynamic)
             state = torch.zeros(2 * one.layer.pairs, dtype=torch.float64)
             if one.name == plan.leading and plan.linear is not None:
-                state = _linear_state(model, one, scaling, record, plan.linear)
+                state = _linear_state(model, one, record, plan.linear)
             values[f"{one.name}_initial_state{suffix}"] = state
     if model.likelihood.varying:
         values["log_noise_constant"] = (noise / TYPICAL).log()
@@ -186,8 +186,7 @@ def _direct(model: Model, plan: Plan) -> Tensor:
 def _linear_state(
     model: Model,
     one: Wire,
-    scaling: Scaling,
-    record: Record,
+    record: PreparedRecord,
     linear: Mapping[str, Tensor],
 ) -> Tensor:
     """Standard normal numbers (2P,) of the first state that the linear fit finds by smoothing."""
@@ -198,14 +197,18 @@ def _linear_state(
     noisy = "g_noise_gain_unit" in linear
     alone = (replace(layer, feedback=(), process_noise=noisy),)
     twin = Model(
-        model.inputs, alone, direct=model.direct, initial_state="integrated", scaling=scaling
+        model.inputs,
+        alone,
+        direct=model.direct,
+        initial_state="integrated",
+        scaling=record.scaling,
     )
     with torch.no_grad():
         ((place, _),) = twin.dynamic
         named = {place.name + k[1:] if k[:2] == "g_" else k: v for k, v in linear.items()}
-        system = twin.system(named, scaling)
-        assembly = assemble(system, time_grid(record.time), scaled_inputs(scaling, record))
-        problem = assembly.with_outputs(scaled_outputs(scaling, record))
+        system = twin.system(named, record.scaling)
+        assembly = assemble(system, record.grid, record.scaled_inputs)
+        problem = assembly.with_outputs(record.scaled_outputs)
         elements, _ = problem.elements()
         _, means, covariances, _, _ = filtering.run(problem.layout, elements[0])
         rows = np.zeros((0, problem.G.shape[-1]))

@@ -10,19 +10,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.layers.noise import TYPICAL
 from pyro_dynogp.layers.sites import Site
-from pyro_dynogp.lti.grid import time_grid
+from pyro_dynogp.lti.grid import TimeGrid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import held_states
+from pyro_dynogp.models.horseshoe import HORSESHOE_SCALE
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.priors import HORSESHOE_SCALE, TimeScale, numerators
+from pyro_dynogp.models.prepared import PreparedRecord
+from pyro_dynogp.models.priors import TimeScale, numerators
 
 
 def starting_values(
-    model: Model, records: Sequence[Record], *, count: int, seed: int, tries: int = 48
+    model: Model, records: Sequence[PreparedRecord], *, count: int, seed: int, tries: int = 48
 ) -> list[dict[str, Tensor]]:
     """Values of every site for the `count` best of `tries` random sets of poles.
 
@@ -34,7 +35,7 @@ def starting_values(
         count: how many starts to return, best first. seed: of the random poles.
         tries: sets of poles to look at; fewer for very long records.
     """
-    scaling = model.scaling or Scaling.from_records(records)
+    scaling = records[0].scaling
     ((_, layer),) = model.dynamic
     generator = np.random.default_rng(seed)
     total = sum(len(record) for record in records)
@@ -83,7 +84,7 @@ def random_poles(pairs: int, scaling: Scaling, generator: np.random.Generator) -
 
 
 def values_given_poles(
-    model: Model, records: Sequence[Record], scaling: Scaling, poles: np.ndarray
+    model: Model, records: Sequence[PreparedRecord], scaling: Scaling, poles: np.ndarray
 ) -> tuple[float, dict[str, Tensor]]:
     """Mean squared residual, and values of every site, for poles (P,) [1/time unit]."""
     ((wire, layer),) = model.dynamic
@@ -91,10 +92,10 @@ def values_given_poles(
     P, n_u, n_y = layer.pairs, model.inputs - model.direct, model.outputs
     designs, targets = [], []
     for record in records:
-        u = (record.inputs - scaling.input_offset) / scaling.input_scale
-        dynamic = _design(poles, record.time, u[:, :n_u], layer.feedthrough)
+        u = record.scaled_inputs.numpy()
+        dynamic = _design(poles, record.grid, u[:, :n_u], layer.feedthrough)
         designs.append(np.concatenate([u[:, n_u:], dynamic], axis=1))
-        targets.append((record.outputs - scaling.output_offset) / scaling.output_scale)
+        targets.append(record.scaled_outputs.numpy())
     X, Y = np.concatenate(designs), np.concatenate(targets)
     weights = np.stack([_ridge(X, Y[:, a]) for a in range(n_y)])  # n_y, columns
     residual = Y - X @ weights.T
@@ -148,10 +149,9 @@ def values_given_poles(
     return float(np.nanmean(residual**2)), tensors
 
 
-def _design(poles: np.ndarray, time: np.ndarray, u: np.ndarray, feedthrough: bool) -> np.ndarray:
+def _design(poles: np.ndarray, grid: TimeGrid, u: np.ndarray, feedthrough: bool) -> np.ndarray:
     """Regressors (n, 2 P n_u + n_u + 1): y = 2 Re sum B/|lambda| x + D u + offset."""
     n, n_u = u.shape
-    grid = time_grid(time)
     columns = []
     if n_u:
         one = torch.ones(len(poles), dtype=torch.complex128)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from pyro_dynogp.statistics.whitening import Whitener
+from pyro_dynogp.statistics.autoregression import Whitener
 
 
 @pytest.mark.parametrize("order", [0, 1, 7, 24])

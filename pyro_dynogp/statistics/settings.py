@@ -41,8 +41,8 @@ class LoopSettings:
             Evidence: convention.
         block_samples: fewest samples of the block that is searched and of the one reported on.
             Evidence: none.
-        measured_samples: fewest of them that were measured.
-            Evidence: none.
+        measured_samples: fewest measured samples of those blocks, and of whatever is tested.
+            Evidence: reason: a filter of order three is all that as many tell.
         fit_share, search_share: shares of a record that is cut anew for the fit and the search.
             Evidence: none.
         stretches: of the searched block where it is shared between fit and search.
@@ -59,6 +59,31 @@ class LoopSettings:
             Evidence: none.
         draws: posterior draws that say what parameter uncertainty leaves in a residual.
             Evidence: cost.
+        replicates: of a residual without the effect, for each p-value.
+            Evidence: size under white, coloured and resonant noise (docs/measurements.md).
+        fewest_replicates: where records are long, and each replicate takes long.
+            Evidence: cost.
+        exceedances: replicates beyond the statistic, below which a fitted tail gives the p-value.
+            Evidence: reason: a count of ten is known to a third of itself.
+        filter_order: highest order of an autoregressive filter of the residual.
+            Evidence: none.
+        noticed: largest p-value at which limits, widths and delays are looked for more finely.
+            Evidence: cost.
+        preference: gain of one more parameter (a delay, an instant, another clock) by which it is
+            named rather than the simpler cause [nats].
+            Evidence: half and double of it say otherwise what docs/measurements.md counts.
+        tied: largest p-value of equal values at an end of the output that are called a limit.
+            Evidence: none.
+        flat: largest slope beyond a limit, as a share of that before it.
+            Evidence: reason: what goes on rising is no limit.
+        step_margin, clock_margin: share of the record at each end where no level shift, and no
+            change of a clock, is looked for. Evidence: reason: too short to tell a level.
+        days_for_hours, days_for_week, days_for_year: fewest days of a record for contrasts of the
+            hours, of the week, of the year. Evidence: reason: fewer do not repeat them.
+        cycles: fewest periods in a record of a disturbance that is called periodic.
+            Evidence: reason: what is slower is drift.
+        harmonic: level of the test of each harmonic, all together. Evidence: convention.
+        outlier: probability that normal errors have an outlier anywhere. Evidence: convention.
 
     Raises:
         ValueError: on a number that is not positive.
@@ -85,6 +110,22 @@ class LoopSettings:
     settled: float = 4.0
     settling_share: float = 0.1
     draws: int = 48
+    replicates: int = 200
+    fewest_replicates: int = 60
+    exceedances: int = 10
+    filter_order: int = 24
+    noticed: float = 0.1
+    preference: float = 3.0
+    tied: float = 0.01
+    flat: float = 0.3
+    step_margin: float = 0.03
+    clock_margin: float = 0.05
+    days_for_hours: int = 3
+    days_for_week: int = 14
+    days_for_year: int = 548
+    cycles: float = 3.0
+    harmonic: float = 0.01
+    outlier: float = 0.05
 
     def __post_init__(self) -> None:
         for entry in fields(self):
@@ -94,6 +135,3 @@ class LoopSettings:
         if self.fit_share + self.search_share >= 1.0:
             got = f"{self.fit_share + self.search_share:g}"
             raise invalid("fit_share and search_share", expected="a sum below 1", got=got)
-
-
-DEFAULTS = LoopSettings()

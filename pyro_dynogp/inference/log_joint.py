@@ -1,0 +1,191 @@
+"""The log joint density of data and sites: of the library's own models directly, else by a trace.
+
+Pyro's tracing of a model takes longer than the compiled recursions do for a thousand samples. A
+`Model` lists its sites and makes a system of their values, so that its density is the sum of the
+priors and of the densities of the outputs, without a trace; any other Pyro function is traced.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import pyro
+import torch
+from torch import Tensor
+from torch.distributions import Distribution, Independent, Normal
+
+from pyro_dynogp.layers.sites import Arguments, Program, Site, Values
+from pyro_dynogp.models.limits import at_limits, log_probability_scale
+from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.output_process import OutputProcess
+from pyro_dynogp.models.outputs import output_process
+from pyro_dynogp.models.prepared import PreparedRecord, Records
+from pyro_dynogp.support.errors import invalid
+
+# Name of a latent site, its prior, its value without gradient.
+Latent = tuple[str, Distribution, Tensor]
+
+
+class LogJoint(Protocol):
+    """Log p(y, values) [nats] as a function of constrained values of every site."""
+
+    def __call__(
+        self, values: Values, count: int | None, inputs: Sequence[Tensor] | None = None
+    ) -> Tensor:
+        """Density () at values (*shape), or (count,) at values (count, *shape) of every site.
+
+        Args:
+            values: of every latent site. count: how many of each; None for one, without dimension.
+            inputs: for each record u (count, n, n_u) [input] in place of its own.
+        """
+
+    def latent(self, values: Values) -> tuple[list[Latent], int]:
+        """Every latent site, in the order of the model, and how many numbers are observed.
+
+        Raises:
+            ValueError: where a latent site has no value.
+        """
+
+
+class Traced:
+    """Density of any Pyro function at what it is called with, by a trace for each evaluation."""
+
+    def __init__(self, model: Program, args: Arguments) -> None:
+        self.model, self.args = model, args
+
+    def trace(self, values: Values, inputs: Sequence[Tensor] | None = None) -> Any:
+        """Trace of the model conditioned on values."""
+        args = self.args if inputs is None else (*self.args, inputs)
+        conditioned = pyro.poutine.condition(self.model, data=dict(values))
+        return pyro.poutine.trace(conditioned).get_trace(*args)
+
+    def latent(self, values: Values) -> tuple[list[Latent], int]:
+        """See `LogJoint`."""
+        nodes = [n for n in self.trace(values).nodes.values() if n["type"] == "sample"]
+        _refuse_unset([node["name"] for node in nodes if not node["is_observed"]])
+        found = [(n["name"], n["fn"], n["value"].detach()) for n in nodes if n["name"] in values]
+        observed = [node["value"] for node in nodes if node["name"] not in values]
+        return found, sum(y.numel() for y in observed if torch.is_tensor(y))
+
+    def __call__(
+        self, values: Values, count: int | None, inputs: Sequence[Tensor] | None = None
+    ) -> Tensor:
+        """See `LogJoint`."""
+        trace = self.trace(values, inputs)
+        trace.compute_log_prob()
+        total: Tensor = trace.log_prob_sum() if count is None else log_prob_by_draw(trace, count)
+        return total
+
+
+def log_prob_by_draw(trace: Any, count: int) -> Tensor:
+    """Log-density (S,) of all sites of a trace, run at S draws at once and scored.
+
+    A site that no draw changes has one density for all of them.
+    """
+    total = torch.zeros(count, dtype=torch.float64)
+    for node in trace.nodes.values():
+        if node["type"] != "sample" or type(node["fn"]).__name__ == "_Subsample":
+            continue
+        log_prob = node["log_prob"]
+        several = log_prob.dim() > 0 and log_prob.shape[0] == count
+        total = total + (log_prob.reshape(count, -1).sum(1) if several else log_prob.sum())
+    return total
+
+
+class Priors:
+    """Log prior density of all sites of a model together: all normal ones as one vector."""
+
+    def __init__(self, sites: Sequence[Site]) -> None:
+        normal = [site for site in sites if isinstance(_base(site), Normal)]
+        self._names = [(site.name, len(site.shape)) for site in normal]
+        self._others = [site for site in sites if not isinstance(_base(site), Normal)]
+        if normal:
+            loc, scale = (
+                torch.cat([getattr(_base(site), name).reshape(-1) for site in normal])
+                for name in ("loc", "scale")
+            )
+            self._normal = Normal(loc, scale, validate_args=False)
+
+    def log_prob(self, values: Values) -> Tensor:
+        """Density () or (k,) of values (*shape) or (k, *shape) of every site."""
+        parts = [site.prior.log_prob(values[site.name]) for site in self._others]
+        if self._names:
+            some = [values[name] for name, _ in self._names]
+            ends = [x.dim() - dims for x, (_, dims) in zip(some, self._names, strict=True)]
+            flat = [x.reshape(*x.shape[:end], -1) for x, end in zip(some, ends, strict=True)]
+            parts.append(self._normal.log_prob(torch.cat(flat, -1)).sum(-1))
+        return torch.stack(parts).sum(0)
+
+
+def _base(site: Site) -> Any:
+    """Distribution of single entries of a site."""
+    prior = site.prior
+    return prior.base_dist if isinstance(prior, Independent) else prior
+
+
+class Direct:
+    """Density of a `Model` whose trajectories are integrated out, given records with outputs.
+
+    Equal to that of its trace to rounding. What does not change between evaluations (the prepared
+    records, priors) is made once.
+
+    Attributes:
+        records: prepared for the model. sites: in the order in which the model samples them.
+        observations: y of each record [output].
+    """
+
+    def __init__(self, model: Model, records: Records) -> None:
+        self.model = model
+        self.records = model.prepare(records)
+        self.sites = model.all_sites(self.records[0].scaling, len(self.records))
+        self.prior = Priors(self.sites)
+        self.observations = [record.observations for record in self.records]
+        self._at_limits = [at_limits(model.layers, each.record) for each in self.records]
+
+    def latent(self, values: Values) -> tuple[list[Latent], int]:
+        """See `LogJoint`."""
+        _refuse_unset([site.name for site in self.sites if site.name not in values])
+        found = [(site.name, site.prior, values[site.name].detach()) for site in self.sites]
+        return found, sum(y.numel() for y in self.observations)
+
+    def outputs(
+        self, values: Values, inputs: Sequence[Tensor] | None = None
+    ) -> list[OutputProcess]:
+        """Distribution of the outputs of each record at values (*b, *shape) of every site."""
+        model, found = self.model, []
+        system = model.system(values, self.records[0].scaling)
+        for index, record in enumerate(self.records):
+            suffix = "" if len(self.records) == 1 else f"_{index}"
+            here = model.begin(system, model.states_of(values, suffix))
+            along = record if inputs is None else record.with_inputs(inputs[index])
+            found.append(output_process(here, along))
+        return found
+
+    def __call__(
+        self, values: Values, count: int | None, inputs: Sequence[Tensor] | None = None
+    ) -> Tensor:
+        """See `LogJoint`."""
+        total = self.prior.log_prob(values)
+        each = zip(self.outputs(values, inputs), self.observations, self._at_limits, strict=True)
+        for outputs, y, at in each:
+            total = total + outputs.log_prob(y)
+            if at.any():
+                total = total + log_probability_scale(at, outputs)
+        return total
+
+
+def _refuse_unset(names: Sequence[str]) -> None:
+    if names:
+        raise invalid("values", expected=f"a value for every latent site, {names} too", got="none")
+
+
+def density_of(model: Program, args: Arguments) -> Direct | Traced:
+    """The density of a model given what it is called with: directly where that is possible."""
+    if isinstance(model, Model) and model.integrate == "all" and len(args) == 1:
+        (given,) = args
+        records: Any = given if isinstance(given, Sequence) else (given,)
+        measured = [x.record if isinstance(x, PreparedRecord) else x for x in records]
+        if all(record.n_outputs for record in measured):
+            return Direct(model, records)
+    return Traced(model, args)

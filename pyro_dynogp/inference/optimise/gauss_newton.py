@@ -1,0 +1,219 @@
+r"""Gauss-Newton climbs of a linear model's posterior, from innovations alone.
+
+Outputs of an exact Gaussian model have the density of their innovations e_i, the errors of one-step
+predictions, with variances d_i. The energy, its gradient and the Fisher matrix are
+
+    E = E_prior + sum_i (e_i^2 / d_i + log 2 pi d_i) / 2,
+    g = g_prior + sum_i e_i e_i' / d_i + (1 - e_i^2 / d_i) l_i' / 2,     l_i = log d_i,
+    F = sum_i e_i' e_i'^T / d_i + l_i' l_i'^T / 2,
+
+primes being derivatives by the unconstrained vector (Fahrmeir & Tutz 2001, section 8.2). These are
+differences over d + 1 points that go through the filter together, forward only; the prior has its
+own curvature. Each iteration tries several dampings of the step, again together, straight and bent
+along the valleys that systems with spare pairs have: half the second derivative of e and log d
+along the step, projected back (geodesic acceleration: Transtrum & Sethna 2012, arXiv:1201.5885).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pyro
+import torch
+from torch import Tensor
+
+from pyro_dynogp.inference.log_joint import Direct
+from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
+from pyro_dynogp.models.exact_outputs import ExactOutputs
+from pyro_dynogp.models.model import Model
+
+if TYPE_CHECKING:
+    from pyro_dynogp.inference.density import Potential
+
+# Change of the unconstrained vector over which a change is a derivative.
+STEP = 1e-6
+# Numbers that a filter may keep of all points that go through it together.
+KEPT = 4_000_000
+# Dampings that are tried, as multiples of the last that was best; largest change of an entry.
+DAMPINGS = np.array([1e-4, 1e-2, 0.1, 1.0, 10.0, 1e3])
+LONGEST = 2.0
+# Share of a step over which its bend is found, and the largest bend in steps.
+ALONG, BENT = 0.02, 0.75
+# Least curvature, and least damping.
+LEAST = 1e-3
+# A climb ends where so many nats are left to gain by the quadratic form and by the last iteration,
+# or were gained in so many iterations.
+FLAT, PATIENCE = 0.01, 8
+
+
+def has_innovations(model: object) -> bool:
+    """Whether a model's density is that of Gaussian innovations, whatever the parameters."""
+    return isinstance(model, Model) and model.is_linear and model.likelihood.gaussian
+
+
+@dataclass(frozen=True, eq=False)
+class Local:
+    """The energy near a point.
+
+    Attributes:
+        energy: -log p(y, values). gradient: (d,). fisher: (d, d), of the outputs.
+        prior: (d, d), curvature of the prior.
+        level: (2, N) errors over their sd, and log variances over sqrt(2). sd: (N,).
+        slopes: (2, d, N) their derivatives.
+    """
+
+    energy: float
+    gradient: np.ndarray
+    fisher: np.ndarray
+    prior: np.ndarray
+    level: np.ndarray
+    sd: np.ndarray
+    slopes: np.ndarray
+
+
+class Innovations:
+    """Energies of a linear model, as of `Potential` without Jacobian, and their local shape.
+
+    Args:
+        potential: of a model for which `has_innovations` holds.
+    """
+
+    def __init__(self, potential: Potential) -> None:
+        assert isinstance(potential.log_density, Direct)
+        self.potential, self.density = potential, potential.log_density
+        self._there = [~torch.isnan(y) for y in self.density.observations]
+        ((_, layer),) = self.density.model.dynamic
+        samples = sum(y.numel() for y in self.density.observations)
+        self.width = max(1, KEPT // (samples * (2 * layer.pairs + 4)))
+
+    def energies(self, z: np.ndarray) -> np.ndarray:
+        """Energies (k,) at z (k, d); infinite where there is none."""
+        errors, variances = self._innovations(z)
+        with torch.no_grad():
+            prior = self._prior(torch.tensor(z)).numpy()
+        with np.errstate(all="ignore"):
+            return _finite(prior + _energies(errors, variances))
+
+    def local(self, z: np.ndarray) -> Local | None:
+        """Energy, gradient and curvatures at z (d,), by one-sided differences; None at an edge."""
+        points = np.concatenate([z[None], z + STEP * np.eye(len(z))])
+        errors, variances = self._innovations(points)
+        x = torch.tensor(points, requires_grad=True)
+        with torch.enable_grad():
+            prior = self._prior(x)
+            gradients = torch.autograd.grad(prior.sum(), x)[0].numpy()
+        with np.errstate(all="ignore"):
+            sd = np.sqrt(variances[0])
+            level = np.stack([errors / sd, np.log(variances) * math.sqrt(0.5)])
+            slopes = (level[:, 1:] - level[:, :1]) / STEP
+            first = level[:, 0]
+            weights = np.stack([first[0], math.sqrt(0.5) * (1.0 - first[0] ** 2)])
+            gradient = gradients[0] + sum(J @ w for J, w in zip(slopes, weights, strict=True))
+            energy = float(prior[0].detach()) + float(_energies(errors[:1], variances[:1])[0])
+            curvature = (gradients[1:] - gradients[0]) / STEP
+            curvature = 0.5 * (curvature + curvature.T)
+            fisher = sum(J @ J.T for J in slopes)
+        if not all(np.isfinite(part).all() for part in (energy, gradient, fisher, curvature)):
+            return None
+        return Local(energy, gradient, fisher, curvature, first, sd, slopes)
+
+    def bends(self, here: Local, z: np.ndarray, moves: np.ndarray) -> np.ndarray:
+        """Second derivatives along moves (k, d) from z (d,), projected on the slopes: (k, d)."""
+        errors, variances = self._innovations(z + ALONG * moves)
+        with np.errstate(all="ignore"):
+            level = np.stack([errors / here.sd, np.log(variances) * math.sqrt(0.5)])
+            change = (level - here.level[:, None]) / ALONG
+        parts = [
+            (2.0 / ALONG) * ((c - moves @ J) @ J.T)
+            for c, J in zip(change, here.slopes, strict=True)
+        ]
+        return np.nan_to_num(sum(parts), posinf=0.0, neginf=0.0)
+
+    def _prior(self, z: Tensor) -> Tensor:
+        """Energies (k,) of the prior at z (k, d)."""
+        with pyro.validation_enabled(False):
+            return -self.density.prior.log_prob(self.potential.unpack(z))
+
+    def _innovations(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Errors and variances, each (k, N), of the samples that were measured at z (k, d)."""
+        portions = [self._portion(torch.tensor(part)) for part in
+                    np.split(z, range(self.width, len(z), self.width))]  # fmt: skip
+        errors, variances = (np.concatenate(part) for part in zip(*portions, strict=True))
+        return errors, variances
+
+    def _portion(self, z: Tensor) -> tuple[np.ndarray, np.ndarray]:
+        """`_innovations` of few points; where one breaks the evaluation of all, NaN for it."""
+        try:
+            with torch.no_grad(), pyro.validation_enabled(False):
+                found = []
+                outputs = self.density.outputs(self.potential.unpack(z))
+                each = zip(outputs, self.density.observations, self._there, strict=True)
+                for one, y, there in each:
+                    assert isinstance(one, ExactOutputs)
+                    found.append([part[:, there].numpy() for part in one.innovations(y)])
+        except (NotPositiveDefiniteError, torch.linalg.LinAlgError, ValueError):
+            if len(z) == 1:
+                nothing = np.full((1, sum(int(one.sum()) for one in self._there)), np.nan)
+                return nothing, nothing
+            halves = [self._portion(half) for half in z.tensor_split(2)]
+            return (np.concatenate([a for a, _ in halves]), np.concatenate([b for _, b in halves]))
+        errors, variances = (np.concatenate(part, axis=1) for part in zip(*found, strict=True))
+        return errors, variances
+
+
+def _energies(errors: np.ndarray, variances: np.ndarray) -> np.ndarray:
+    return np.asarray(0.5 * (errors**2 / variances + np.log(2.0 * np.pi * variances)).sum(1))
+
+
+def _finite(energies: np.ndarray) -> np.ndarray:
+    return np.where(np.isfinite(energies), energies, np.inf)
+
+
+def climb(
+    innovations: Innovations, z: np.ndarray, steps: int
+) -> tuple[np.ndarray, list[float], str]:
+    """Lowest point from z (d,) on, the energy after each iteration, and why it ended.
+
+    Args:
+        innovations: of the model. steps: most iterations.
+    """
+    history: list[float] = []
+    damping = 1.0
+    while len(history) < steps:
+        here = innovations.local(z)
+        if here is None:
+            return z, history, "no derivative"
+        curvature, axes = np.linalg.eigh(here.fisher + here.prior)
+        curvature = np.maximum(np.abs(curvature), LEAST)
+        slope = axes.T @ here.gradient
+        tried = damping * DAMPINGS
+        inverse = 1.0 / (curvature + tried[:, None])  # of each damping, along the axes
+        moves = _shortened(-(slope * inverse) @ axes.T)
+        bends = -0.5 * ((innovations.bends(here, z, moves) @ axes) * inverse) @ axes.T
+        length, bent = (np.linalg.norm(x, axis=1, keepdims=True) for x in (moves, bends))
+        bends *= np.minimum(1.0, BENT * length / np.maximum(bent, 1e-300))
+        moves = np.concatenate([moves, moves + bends])
+        energies = innovations.energies(z + moves)
+        best = int(energies.argmin())
+        gain = here.energy - float(energies[best])
+        left = 0.5 * float((slope**2 / curvature).sum())
+        history.append(here.energy - max(gain, 0.0))
+        if gain > 0.0:
+            z, damping = z + moves[best], max(float(tried[best % len(tried)]), LEAST)
+        else:
+            damping *= 1e4
+        lately = history[-PATIENCE - 1] - history[-1] if len(history) > PATIENCE else np.inf
+        if gain < FLAT and (left < FLAT or lately < FLAT):
+            return z, history, "nothing left to gain"
+        if damping > 1e4 * curvature.max():
+            return z, history, "no step gains anything"
+    return z, history, "all steps used"
+
+
+def _shortened(moves: np.ndarray) -> np.ndarray:
+    """Moves (k, d) of which no entry is longer than `LONGEST`."""
+    longest = np.maximum(np.abs(moves).max(1, keepdims=True), LONGEST)
+    return np.asarray(moves * (LONGEST / longest))

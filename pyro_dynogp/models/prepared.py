@@ -1,0 +1,80 @@
+"""A record as a model sees it: made once where a run begins, then handed down."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from torch import Tensor
+
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.scaling import Scaling
+from pyro_dynogp.lti.grid import TimeGrid, time_grid
+from pyro_dynogp.support.tensors import as_tensor
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedRecord:
+    """A checked record with the channels of a model, its time grid, and its scaled signals.
+
+    `Model.prepare` makes one. What takes it does not check the record again.
+
+    Attributes:
+        record: with the model's channels as inputs.
+        scaling: of the training record.
+        grid: its times.
+        inputs: u (*b, n, n_u) float64 [input].
+        scaled_inputs: the same in standard deviations of the training record.
+        observations: y (n,) of one output, (n, n_y) of several [output]; NaN where missing.
+    """
+
+    record: Record
+    scaling: Scaling
+    grid: TimeGrid
+    inputs: Tensor
+    scaled_inputs: Tensor
+    observations: Tensor
+
+    @classmethod
+    def of(cls, record: Record, scaling: Scaling) -> PreparedRecord:
+        """From a record that is known to fit the model, its channels made."""
+        signals, grid = record.tensors(), time_grid(record.time)
+        scaled = _scaled(signals.inputs, scaling)
+        return cls(record, scaling, grid, signals.inputs, scaled, signals.observations)
+
+    def __len__(self) -> int:
+        return len(self.record)
+
+    def with_inputs(self, inputs: Tensor) -> PreparedRecord:
+        """The same times and outputs with other inputs u (*b, n, n_u) [input]."""
+        return replace(self, inputs=inputs, scaled_inputs=_scaled(inputs, self.scaling))
+
+    @property
+    def has_outputs(self) -> bool:
+        """Whether there are outputs at all."""
+        return self.record.n_outputs > 0
+
+    @property
+    def scaled_outputs(self) -> Tensor:
+        """Outputs (n, n_y) in standard deviations of the training record."""
+        y = self.observations if self.record.n_outputs > 1 else self.observations[:, None]
+        return (y - as_tensor(self.scaling.output_offset)) / as_tensor(self.scaling.output_scale)
+
+
+# What a model is called with.
+Records = Record | Sequence[Record] | Sequence[PreparedRecord]
+
+
+def _scaled(inputs: Tensor, scaling: Scaling) -> Tensor:
+    """Inputs (*b, n, n_u) in standard deviations of the training record."""
+    if not inputs.shape[-1]:
+        return inputs
+    return (inputs - as_tensor(scaling.input_offset)) / as_tensor(scaling.input_scale)
+
+
+def as_measured(records: Records) -> tuple[Record, ...]:
+    """The records behind what a model is called with."""
+    several = (records,) if isinstance(records, Record) else records
+    return tuple(
+        record.record if isinstance(record, PreparedRecord) else record for record in several
+    )

@@ -1,0 +1,220 @@
+"""What a model is made of: layers in their places, noise, channels; and which records fit it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal, Self, TypedDict, cast, get_args
+
+from pyro_dynogp.data.channels import Channel, count_direct, prepared
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.records import as_records
+from pyro_dynogp.data.scaling import Scaling
+from pyro_dynogp.layers.noise import Gaussian, Likelihood
+from pyro_dynogp.models.prepared import PreparedRecord, Records
+from pyro_dynogp.models.priors import PriorName
+from pyro_dynogp.models.wiring import Dynamic, Layer, Static, Wire, wire
+from pyro_dynogp.support.errors import invalid
+
+Integrate = Literal["none", "last", "all"]
+InitialState = Literal["auto", "site", "integrated", "zero"]
+
+
+class ModelOptions(TypedDict, total=False):
+    """Arguments of `Model` that every architecture takes by name."""
+
+    initial_state: InitialState
+    integrate: Integrate
+    priors: PriorName
+    direct: int
+    channels: tuple[Channel, ...]
+    scaling: Scaling | None
+    output: str | None
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What a model is made of. The fields are the arguments of `Model`.
+
+    Raises:
+        ValueError: on layers that do not fit together, or unknown options.
+    """
+
+    inputs: int
+    layers: tuple[Layer, ...]
+    likelihood: Likelihood = field(default_factory=Gaussian)
+    initial_state: InitialState = "auto"
+    integrate: Integrate = "none"
+    priors: PriorName = "default"
+    direct: int = 0
+    channels: tuple[Channel, ...] = ()
+    scaling: Scaling | None = None
+    output: str | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.inputs, int) or self.inputs < 0:
+            raise invalid("inputs", expected="a whole number >= 0", got=repr(self.inputs))
+        object.__setattr__(self, "layers", tuple(self.layers))
+        object.__setattr__(self, "channels", tuple(self.channels))
+        if not isinstance(self.likelihood, Likelihood):
+            raise invalid(
+                "likelihood",
+                expected="Gaussian(), StudentT(...) or Heteroscedastic(...)",
+                got=repr(self.likelihood),
+            )
+        for name, choices in (
+            ("priors", get_args(PriorName)),
+            ("integrate", get_args(Integrate)),
+            ("initial_state", get_args(InitialState)),
+        ):
+            if getattr(self, name) not in choices:
+                *most, last = (repr(choice) for choice in choices)
+                expected = f"{', '.join(most)} or {last}"
+                raise invalid(name, expected=expected, got=repr(getattr(self, name)))
+        least = count_direct(self.channels)
+        if not isinstance(self.direct, int) or not least <= self.direct <= self.inputs:
+            expected = f"a whole number from {least} to {self.inputs}"
+            raise invalid("direct", expected=expected, got=repr(self.direct))
+        end = self.output_wire.layer  # placing the layers refuses those that do not fit together
+        if self.integrate == "last" and not (
+            isinstance(end, Dynamic) and self.likelihood == Gaussian() and not self.direct
+        ):
+            raise invalid(
+                "integrate",
+                expected="'none' or 'all': only a dynamic last layer under constant Gaussian "
+                "noise and without direct inputs can be integrated by itself",
+                got="'last'",
+            )
+        if self.has_feedback:
+            self._check_feedback()
+
+    def _check_feedback(self) -> None:
+        """Refuse what a loop cannot do."""
+        if self.integrate != "all":
+            raise invalid(
+                "integrate",
+                expected="'all' for a model with feedback, whose trajectories depend on each other "
+                "sample by sample and cannot be sample sites",
+                got=repr(self.integrate),
+            )
+        if self.likelihood.varying and self.likelihood.of == "output":
+            raise invalid(
+                "likelihood",
+                expected="noise of constant size, or one that varies with the inputs, for a model "
+                "with feedback",
+                got=repr(self.likelihood),
+            )
+
+    @cached_property
+    def wires(self) -> tuple[Wire, ...]:
+        """The layers in their places, with names."""
+        return wire(self.inputs - self.direct, self.layers, self.output)
+
+    @property
+    def output_wire(self) -> Wire:
+        """The layer whose output is measured, in its place."""
+        return next(w for w in self.wires if w.last)
+
+    @property
+    def has_feedback(self) -> bool:
+        """Whether a static layer's output comes back to an earlier layer."""
+        return any(w.feedback for w in self.wires)
+
+    @property
+    def outputs(self) -> int:
+        """n_y, the width of the layer that is measured."""
+        return self.output_wire.layer.outputs
+
+    @property
+    def several_outputs(self) -> bool:
+        """Whether outputs have a dimension of their own."""
+        return self.outputs > 1
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether it is one layer of linear dynamics, whatever the noise."""
+        return len(self.layers) == 1 and isinstance(self.layers[0], Dynamic)
+
+    @property
+    def has_function(self) -> bool:
+        """Whether there is a static layer."""
+        return any(isinstance(layer, Static) for layer in self.layers)
+
+    @property
+    def dynamic(self) -> tuple[tuple[Wire, Dynamic], ...]:
+        """The dynamic layers in their places, first to last."""
+        return tuple((w, w.layer) for w in self.wires if isinstance(w.layer, Dynamic))
+
+    @property
+    def seen_by_functions(self) -> tuple[Wire, ...]:
+        """Dynamic layers with inputs whose trajectory a static layer sees, also through others."""
+        names = {
+            name
+            for place, reader in enumerate(self.wires)
+            if any(isinstance(w.layer, Static) for w in self.wires[place:])
+            for name in reader.sources
+        }
+        return tuple(w for w, _ in self.dynamic if w.channels + w.fed and w.name in names)
+
+    @property
+    def state_sites(self) -> tuple[Wire, ...]:
+        """Dynamic layers whose first state is a site."""
+        if self.initial_state == "site":
+            return tuple(w for w, _ in self.dynamic if w.channels + w.fed)
+        return self.seen_by_functions if self.initial_state == "auto" else ()
+
+    @property
+    def collapsed(self) -> Self:
+        """The same model with all trajectories integrated out."""
+        return replace(self, integrate="all")
+
+    def scaled_to(self, records: Record | Sequence[Record]) -> Self:
+        """The same model with the scaling of the given training record(s)."""
+        return replace(self, scaling=Scaling.from_records(self._with_channels(records)))
+
+    def _with_channels(self, records: Record | Sequence[Record]) -> tuple[Record, ...]:
+        return tuple(prepared(record, self.channels) for record in as_records(records))
+
+    def check(self, records: Record | Sequence[Record]) -> tuple[Record, ...]:
+        """Records with the model's channels, whose channels and units fit the model.
+
+        Raises:
+            ValueError: where the number of channels or a unit differs.
+        """
+        checked = self._with_channels(records)
+        for record in checked:
+            for what, expected, got in (
+                ("inputs", self.inputs, record.n_inputs),
+                ("outputs", self.outputs, record.n_outputs or self.outputs),
+            ):
+                if expected != got:
+                    raise invalid(
+                        "record",
+                        expected=f"{expected} {what}, as the model has",
+                        got=f"{got}",
+                        advice=f"Choose channels with record.select(...) or set {what}={got}.",
+                    )
+            if self.scaling is not None:
+                self.scaling.check(record, outputs=record.n_outputs > 0)
+        return checked
+
+    def prepare(self, records: Records) -> tuple[PreparedRecord, ...]:
+        """Records as the model sees them; those that are prepared already as they are.
+
+        Args:
+            records: one or several. A model without a scaling learns it from them.
+
+        Raises:
+            ValueError: as of `check`; where they are prepared with another scaling.
+        """
+        ready = [] if isinstance(records, Record) else [
+            record for record in records if isinstance(record, PreparedRecord)]  # fmt: skip
+        if not isinstance(records, Record) and ready and len(ready) == len(records):
+            if any(self.scaling not in (None, record.scaling) for record in ready):
+                expected = "records prepared with the model's scaling"
+                raise invalid("records", expected=expected, got="another scaling")
+            return tuple(ready)
+        checked = self.check(cast(Record | Sequence[Record], records))
+        scaling = self.scaling or Scaling.from_records(checked)
+        return tuple(PreparedRecord.of(record, scaling) for record in checked)

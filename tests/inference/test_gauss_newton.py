@@ -1,0 +1,187 @@
+"""Gauss-Newton climbs of linear models: gradients, Fisher matrices, and where they end."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import pyro_dynogp as dgp
+from pyro_dynogp.data.channels import Trend
+from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.methods.mode import linear_starts
+from pyro_dynogp.inference.optimise.gauss_newton import (
+    FLAT,
+    Innovations,
+    climb,
+    has_innovations,
+)
+from pyro_dynogp.inference.optimise.maximum import maximise
+from pyro_dynogp.inference.run import Run
+from pyro_dynogp.inference.starts.poles import starting_values
+from tests.inference.test_log_joint import GAPS, ONE, TWO, UNEVEN
+
+Linear = dgp.LinearDynamicGP
+ALONE = Run(workers=1)
+CASES = {
+    "linear": (Linear(1, pairs=3), ONE),
+    "uneven steps": (Linear(1, pairs=2), UNEVEN),
+    "missing samples": (Linear(1, pairs=2), GAPS),
+    "two outputs, records": (Linear(1, outputs=2, pairs=2), (TWO, TWO[:20])),
+    "first state a site": (Linear(1, pairs=2, initial_state="site"), (ONE, GAPS[:25])),
+    "known trajectory": (
+        Linear(1, pairs=2, initial_state="zero", process_noise=False), GAPS,
+    ),
+    "two known trajectories": (
+        Linear(1, outputs=2, pairs=2, initial_state="zero", process_noise=False), TWO,
+    ),
+    "direct": (Linear(2, pairs=1, direct=1, channels=(Trend(0.0, 4.0),)), ONE),
+    "no inputs": (Linear(0, pairs=2), ONE.select(inputs=[])),
+    "varying noise": (dgp.Cascade(1, (dgp.Dynamic(pairs=2),), dgp.Heteroscedastic(4)), GAPS),
+    "varying noise, two outputs": (
+        dgp.Cascade(1, (dgp.Dynamic(2, pairs=2),), dgp.Heteroscedastic(4)), TWO,
+    ),
+}  # fmt: skip
+
+
+def prepared(name):
+    """Innovations of a case, and a point near its start."""
+    model, records = CASES[name]
+    target = model.scaled_to(records).collapsed
+    ready = target.prepare(records)
+    (start,) = starting_values(target, ready, count=1, seed=0)
+    potential = Potential(target, (ready,), start)
+    z = potential.pack(start).numpy()
+    return Innovations(potential), z + 0.1 * np.random.default_rng(0).standard_normal(len(z))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_energy_and_gradient_are_those_of_the_density(name):
+    innovations, z = prepared(name)
+    energy, gradient = innovations.potential.value_and_gradient(z)
+    here = innovations.local(z)
+    assert here.energy == pytest.approx(energy, rel=1e-11)
+    assert innovations.energies(z[None])[0] == pytest.approx(energy, rel=1e-11)
+    size = np.abs(gradient).max()
+    np.testing.assert_allclose(here.gradient, gradient, rtol=1e-4, atol=1e-4 * size)
+
+
+def test_curvature_of_the_prior():
+    innovations, z = prepared("linear")
+    x = torch.tensor(z)[None]
+    exact = torch.autograd.functional.hessian(lambda x: innovations._prior(x).sum(), x)
+    here = innovations.local(z)
+    np.testing.assert_allclose(here.prior, exact[0, :, 0].numpy(), rtol=1e-5, atol=1e-4)
+
+
+def test_fisher_matrix_is_the_covariance_of_scores():
+    """Over outputs drawn from the model the score has the Fisher matrix as its covariance."""
+    model = Linear(1, pairs=1).scaled_to(ONE).collapsed
+    (start,) = starting_values(model, model.prepare(ONE), count=1, seed=0)
+    potential = Potential(model, (ONE,), {**start, "noise_sd": torch.tensor([0.2]).double()})
+    innovations, z = Innovations(potential), potential.pack(potential.at).numpy()
+    x = torch.tensor(z, requires_grad=True)
+    (prior,) = torch.autograd.grad(innovations._prior(x[None]).sum(), x)
+    density = innovations.density
+    (outputs,) = density.outputs(potential.at)
+    count = 500
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        drawn = outputs.sample((count,))
+    scores, fisher = [], np.zeros((len(z), len(z)))
+    for y in drawn:
+        density.observations = [y]
+        here = innovations.local(z)
+        scores.append(here.gradient - prior.numpy())
+        fisher += here.fisher / count
+    root = np.linalg.inv(np.linalg.cholesky(fisher))
+    white = np.array(scores) @ root.T
+    assert np.abs(white.mean(0)).max() < 4.0 / np.sqrt(count)
+    np.testing.assert_allclose(white.T @ white / count, np.eye(len(z)), atol=5.5 / np.sqrt(count))
+
+
+def test_bends_are_second_derivatives():
+    innovations, z = prepared("linear")
+    here = innovations.local(z)
+    move = 0.02 * np.random.default_rng(1).standard_normal((1, len(z)))
+
+    def level(t):
+        e, d = (part[0] for part in innovations._innovations(z + t * move))
+        return np.stack([e / here.sd, np.sqrt(0.5) * np.log(d)])
+
+    h = 1e-2
+    second = (level(h) - 2.0 * level(0.0) + level(-h)) / h**2
+    expected = sum(J @ s for J, s in zip(here.slopes, second, strict=True))
+    found = innovations.bends(here, z, move)[0]
+    np.testing.assert_allclose(found, expected, atol=0.05 * np.abs(expected).max())
+
+
+def test_a_point_without_density_leaves_the_others_alone():
+    innovations, z = prepared("linear")
+    points = np.stack([z, np.full_like(z, 800.0), z + 0.01])
+    energies = innovations.energies(points)
+    assert np.isinf(energies[1])
+    assert energies[2] == pytest.approx(innovations.energies(points[2:])[0], rel=1e-12)
+    assert innovations.local(points[1]) is None
+    assert climb(innovations, points[1], 5)[1:] == ([], "no derivative")
+
+
+def test_portions_are_the_whole():
+    innovations, z = prepared("two outputs, records")
+    points = z + 1e-3 * np.arange(7)[:, None]
+    whole = innovations.energies(points)
+    innovations.width = 3
+    np.testing.assert_allclose(innovations.energies(points), whole, rtol=1e-13)
+
+
+def test_a_climb_ends_where_no_gradient_is_left(record):
+    model = Linear(1, pairs=1).scaled_to(record).collapsed
+    (start,) = starting_values(model, model.prepare(record), count=1, seed=0)
+    potential = Potential(model, (record,), start)
+    z, history, message = climb(Innovations(potential), potential.pack(start).numpy(), 60)
+    assert message == "nothing left to gain"
+    assert (np.diff(history) <= 0.0).all()
+    energy, gradient = potential.value_and_gradient(z)
+    assert history[-1] == pytest.approx(energy, rel=1e-10)
+    # By the exact Hessian there is less than twice the tolerance left.
+    left = 0.5 * gradient @ np.linalg.solve(potential.hessian(z), gradient)
+    assert abs(left) < 2.0 * FLAT
+
+
+def test_default_starts_end_at_least_as_high_as_random_ones_by_lbfgs(record):
+    """With a pair to spare the density has several modes, which random starts miss."""
+    model = Linear(1, pairs=2).scaled_to(record).collapsed
+    ready = model.prepare(record)
+    starts = linear_starts(model, ready, None, 0)
+    new = maximise(model, ready, starts, ALONE, optimizer="gauss-newton", steps=60)
+    random = starting_values(model, ready, count=6, seed=0)
+    old = maximise(model, ready, random, ALONE, optimizer="lbfgs", steps=500)
+    assert new[0].energy < old[0].energy + 0.1
+    assert len(new[0].history) < len(old[0].history)
+
+
+def test_which_models_have_innovations():
+    assert has_innovations(Linear(1))
+    assert has_innovations(CASES["varying noise"][0])
+    assert not has_innovations(dgp.Wiener(1))
+    assert not has_innovations(dgp.Cascade(1, (dgp.Dynamic(),), dgp.StudentT()))
+    assert not has_innovations(lambda: None)
+
+
+def test_is_refused_where_there_are_none(record):
+    with pytest.raises(ValueError, match=r"optimizer: expected .* got 'gauss-newton'"):
+        dgp.fit(dgp.Wiener(1), record, method="map", optimizer="gauss-newton", progress=False)
+
+
+def test_starts_of_one_seed_give_the_same_bits_by_any_number_of_processes(record):
+    model = replace(Linear(1, pairs=1).scaled_to(record[:80]), integrate="all")
+    starts = starting_values(model, model.prepare(record[:80]), count=3, seed=0)
+    one, two = (
+        maximise(
+            model, record[:80], starts, Run(workers=workers), optimizer="gauss-newton", steps=10
+        )
+        for workers in (1, 2)
+    )
+    for a, b in zip(one, two, strict=True):
+        assert a.energy == b.energy
+        assert all(torch.equal(a.values[name], b.values[name]) for name in a.values)
