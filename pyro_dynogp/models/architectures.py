@@ -170,8 +170,8 @@ def NonlinearFeedback(
     """Linear dynamics g whose output comes back through a static nonlinearity f.
 
     A spring or friction that is not linear, a tank that empties through a valve:
-    x' = A x + B u + F f(C x), y = C x + D u, with f held from sample to sample. Beyond the data f
-    goes on as a straight line.
+    x' = A x + B u + F f(C x), y = C x + D u, with f held from sample to sample. Beyond the data
+    what comes back is constant, so that free runs stay bounded.
 
     Args: as those of `Wiener`; f sees all outputs and has as many, the output measured is g's.
 

@@ -18,6 +18,7 @@ from pyro_dynogp.layers.static import StaticPrior
 from pyro_dynogp.models.explicit import observe_explicit
 from pyro_dynogp.models.limits import at_limits, log_probability_scale, scaled_limits
 from pyro_dynogp.models.outputs import output_process
+from pyro_dynogp.models.past_inputs import past_input_covariance
 from pyro_dynogp.models.prepared import Records
 from pyro_dynogp.models.priors import FLAT, ModesPrior, TimeScale, direct_site
 from pyro_dynogp.models.structure import Structure
@@ -149,7 +150,11 @@ class Model(Structure):
     ) -> DynamicSystem:
         """One dynamic layer at values of its sites."""
         modes = self._modes_prior(place, layer, time_scale).modes(values)
-        return DynamicSystem(modes, 1.0 / time_scale.typical_rate)
+        memory = 1.0 / time_scale.typical_rate
+        if place.fed and place.channels:  # what comes back is no past input
+            alone = replace(modes, input_gain=modes.B[..., : place.channels], feedthrough=None)
+            return DynamicSystem(modes, past_input_covariance(alone, memory))
+        return DynamicSystem(modes, memory)
 
     def static_function(
         self, place: Wire, layer: Static, values: Values, scaling: Scaling | None = None
