@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,6 +24,11 @@ BLOCKS, LEAST = 8, 2
 # What is left of noise gains that are switched off, and the share of the error that noise has to
 # take away to pay.
 SILENT, WORTH = 1e-3, 0.01
+# Said where no start leads to free runs that are better than those of the linear model.
+NO_BETTER = (
+    "fit: free runs through the training record are no better than those of the linear model that "
+    "the climb began from. Try more pairs, other restarts (seed), or a longer record."
+)
 
 
 def free_run_error(model: Model, values: Mapping[str, Tensor], records: Records) -> float:
@@ -85,7 +90,21 @@ def silenced(
     return replace(optimum, energy=float(energy), values=values)
 
 
-def noise_pays(model: Model, records: Records, noisy: Optimum, quiet: Optimum) -> bool:
-    """Whether free runs over blocks are better by a hundredth with process noise than without."""
-    with_noise, without = (free_run_error(model, one.values, records) for one in (noisy, quiet))
-    return with_noise < (1.0 - WORTH) * without
+def better_by_free_runs(
+    model: Model,
+    records: Records,
+    noisy: Sequence[Optimum],
+    quiet: Sequence[Optimum],
+    start: Mapping[str, Tensor],
+) -> list[Optimum]:
+    """Optima with process noise where runs are better with it by a hundredth, else those without.
+
+    Args:
+        model: with process noise, collapsed. records: of it. noisy: optima of it, best first.
+        quiet: optima without process noise, best first. start: values of all sites of the model.
+    """
+    silent = [silenced(model, records, one, start) for one in quiet]
+    with_noise, without = (
+        free_run_error(model, optima[0].values, records) for optima in (noisy, silent)
+    )
+    return list(noisy) if with_noise < (1.0 - WORTH) * without else silent

@@ -1,6 +1,8 @@
 """A fitted spring through every verb, and what feedback refuses."""
 
+import re
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -114,6 +116,20 @@ def test_runs_that_diverge_are_reported_where_they_do(fitted):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         fit.forecast(record[:450], record[450:])
+
+
+def test_the_page_runs():
+    page = (Path(__file__).parents[2] / "docs" / "structures.md").read_text()
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.S)
+    names = {}
+    exec(code.replace("), train)", "), train, restarts=1, workers=1, progress=False)", 1), names)
+    error = names["forecast"].mean[:, 0] - names["position"][450:]
+    assert np.sqrt(np.mean(error**2)) < 0.05 * names["position"].std()
+    x, f = names["spring"].x, names["spring"].mean[:, 0]
+    bend = f - np.polyval(np.polyfit(x, f, 1), x)  # beside a line: what a cube leaves
+    cube = x**3 - np.polyval(np.polyfit(x, x**3, 1), x)
+    middle = np.abs(x) < 1.8
+    assert abs(np.corrcoef(bend[middle], cube[middle])[0, 1]) > 0.9
 
 
 def test_several_records_and_another_step():

@@ -15,7 +15,7 @@ import numpy as np
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.density import WALL
 from pyro_dynogp.inference.fitted import Fitted
-from pyro_dynogp.inference.free_runs import free_run_error, noise_pays, silenced
+from pyro_dynogp.inference.free_runs import NO_BETTER, better_by_free_runs, free_run_error
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.optimise.gauss_newton import has_innovations
 from pyro_dynogp.inference.optimise.maximum import EFFORT, Effort, Optimizer, Optimum, maximise
@@ -46,13 +46,8 @@ STEPS: Mapping[str, int] = MappingProxyType(
 # Most starts of linear fits of each kind; iterations of those that come before cascades.
 RANDOM = 6
 LINEAR_STEPS = 40
-# Starts of a model with feedback; sets of them, until one beats the linear model in free runs; what
-# is said where none does.
+# Starts of a model with feedback; sets of them, until one beats the linear model in free runs.
 FEEDBACK_STARTS, ATTEMPTS = 4, 2
-NO_BETTER = (
-    "fit: free runs through the training record are no better than those of the linear model that "
-    "the climb began from. Try more pairs, other restarts (seed), or a longer record."
-)
 # Measurement noise, in sds of the outputs, from which starts without process noise climb at least.
 UNEXPLAINED = 0.5
 
@@ -306,8 +301,7 @@ def climb(
     optima = optima_of(model, [*learnt, *starts], "cascade")
     if not model.has_feedback or not better:
         return optima
-    silent = [silenced(model, records, one, starts[0]) for one in better]
-    return optima if noise_pays(model, records, optima[0], silent[0]) else silent
+    return better_by_free_runs(model, records, optima, better, starts[0])
 
 
 def grow(
