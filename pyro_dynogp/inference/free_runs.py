@@ -15,7 +15,7 @@ from pyro_dynogp.inference.starts.poles import grown
 from pyro_dynogp.lti.arithmetic import SEGMENT
 from pyro_dynogp.models.assembly import assemble
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.prepared import Records
+from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.moments import filtering
 from pyro_dynogp.moments.stepping import step_through
 
@@ -24,28 +24,26 @@ BLOCKS, LEAST = 8, 2
 # What is left of noise gains that are switched off, and the share of the error that noise has to
 # take away to pay.
 SILENT, WORTH = 1e-3, 0.01
-# Said where no start leads to free runs that are better than those of the linear model.
-NO_BETTER = (
-    "fit: free runs through the training record are no better than those of the linear model that "
-    "the climb began from. Try more pairs, other restarts (seed), or a longer record."
-)
 
 
-def free_run_error(model: Model, values: Mapping[str, Tensor], records: Records) -> float:
+def free_run_error(
+    model: Model, values: Mapping[str, Tensor], records: Sequence[PreparedRecord]
+) -> float:
     """Root mean square error of runs through blocks of records, in scaled outputs.
 
     Each block begins at the mean of the filter's state; functions are at their mean and there is no
     process noise from there on. Infinite where a run diverges.
 
     Args:
-        model: trajectories integrated out. values: of all its sites. records: that they are of.
+        model: with its scaling, trajectories integrated out. values: of all its sites.
+        records: prepared, that the values are of.
     """
-    prepared = model.prepare(records)
+    assert model.scaling is not None
     squares, count = 0.0, 0
     with torch.no_grad():
-        system = model.system(values, prepared[0].scaling)
-        for index, record in enumerate(prepared):
-            suffix = "" if len(prepared) == 1 else f"_{index}"
+        system = model.system(values, model.scaling)
+        for index, record in enumerate(records):
+            suffix = "" if len(records) == 1 else f"_{index}"
             here = model.begin(system, model.states_of(values, suffix))
             assembly = assemble(here, record.grid, record.scaled_inputs)
             problem = assembly.with_outputs(record.scaled_outputs)
@@ -72,7 +70,7 @@ def free_run_error(model: Model, values: Mapping[str, Tensor], records: Records)
 
 def silenced(
     model: Model,
-    records: Records,
+    records: Sequence[PreparedRecord],
     optimum: Optimum,
     start: Mapping[str, Tensor],
 ) -> Optimum:
@@ -90,21 +88,9 @@ def silenced(
     return replace(optimum, energy=float(energy), values=values)
 
 
-def better_by_free_runs(
-    model: Model,
-    records: Records,
-    noisy: Sequence[Optimum],
-    quiet: Sequence[Optimum],
-    start: Mapping[str, Tensor],
-) -> list[Optimum]:
-    """Optima with process noise where runs are better with it by a hundredth, else those without.
-
-    Args:
-        model: with process noise, collapsed. records: of it. noisy: optima of it, best first.
-        quiet: optima without process noise, best first. start: values of all sites of the model.
-    """
-    silent = [silenced(model, records, one, start) for one in quiet]
-    with_noise, without = (
-        free_run_error(model, optima[0].values, records) for optima in (noisy, silent)
-    )
-    return list(noisy) if with_noise < (1.0 - WORTH) * without else silent
+def noise_pays(
+    model: Model, records: Sequence[PreparedRecord], noisy: Optimum, quiet: Optimum
+) -> bool:
+    """Whether free runs over blocks are better by a hundredth with process noise than without."""
+    with_noise, without = (free_run_error(model, one.values, records) for one in (noisy, quiet))
+    return with_noise < (1.0 - WORTH) * without

@@ -170,8 +170,8 @@ def NonlinearFeedback(
     """Linear dynamics g whose output comes back through a static nonlinearity f.
 
     A spring or friction that is not linear, a tank that empties through a valve:
-    x' = A x + B u + F f(C x), y = C x + D u, with f held from sample to sample. Beyond the data
-    what comes back is constant, so that free runs stay bounded.
+    x' = A x + B u + F f(C x), y = C x + D u, with f held from sample to sample. Beyond the data f
+    goes on as a straight line.
 
     Args: as those of `Wiener`; f sees all outputs and has as many, the output measured is g's.
 
@@ -184,8 +184,8 @@ def NonlinearFeedback(
         Dynamic(outputs=outputs, pairs=pairs, process_noise=process_noise, feedback=("f",)),
         Static(outputs=outputs, inducing=inducing, kernel=kernel),
     )
-    options = {"integrate": "all", "output": "g", **options}
-    return Model(inputs, layers, likelihood or Gaussian(), **options)
+    looped: ModelOptions = {"integrate": "all", "output": "g", **options}
+    return Model(inputs, layers, likelihood or Gaussian(), **looped)
 
 
 def HammersteinWiener(

@@ -42,21 +42,23 @@ def describe(model: Model) -> tuple[Part, ...]:
     ]
     count = model.inputs - model.direct
     inputs = Part("inputs", f"{count} input{'s' if count != 1 else ''}")
-    layers = [_layer(layer) for layer in model.layers]
+    back = {name for wire in model.wires for name in wire.feedback}
+    layers = [_layer(wire.layer, fed_back=wire.name in back) for wire in model.wires]
     plain = model.direct - sum(len(channel.names) for channel in model.channels if channel.direct)
     if plain:
         direct.append(Part("direct inputs", f"plus {plain} direct inputs", joins=True))
     return (inputs, *driving, *layers, *direct, _noise(model.likelihood))
 
 
-def _layer(layer: Dynamic | Static) -> Part:
+def _layer(layer: Dynamic | Static, *, fed_back: bool) -> Part:
     if isinstance(layer, Dynamic):
         noise = "process noise" if layer.process_noise else "no process noise"
         pairs = f"{layer.pairs} pair{'s' if layer.pairs != 1 else ''} of poles"
         return Part("dynamics", "linear dynamics", f"{pairs}, {noise}")
     limits = [f"{at:.4g}" for at in layer.limits or () if at is not None]
     stops = f", stops at {' and '.join(limits)}" if limits else ""
-    return Part("function", "static function", f"{layer.inducing} inducing values{stops}")
+    heading = "static function in feedback" if fed_back else "static function"
+    return Part("function", heading, f"{layer.inducing} inducing values{stops}")
 
 
 def _noise(likelihood: Likelihood) -> Part:

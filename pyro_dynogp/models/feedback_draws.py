@@ -61,10 +61,11 @@ def draw_outputs(
     mean = signals[wire.name]
     variance = torch.zeros_like(mean)
     if isinstance(layer, StaticSystem) and not wire.pathwise:
-        seen = see(signals, wire)
         assert isinstance(wire.layer, Static)
-        residual = random.residual[wire.name]
-        _, mean, variance = draw_static(wire.layer.support, layer, seen, residual, switches)
+        seen = see(signals, wire)
+        _, mean, variance = draw_static(
+            wire.layer.support, layer, seen, random.residual[wire.name], switches
+        )
     level = system.level(inputs)
     return Drawn(signals, mean if level is None else mean + level, variance.expand(mean.shape))
 

@@ -151,9 +151,8 @@ class Model(Structure):
         """One dynamic layer at values of its sites."""
         modes = self._modes_prior(place, layer, time_scale).modes(values)
         memory = 1.0 / time_scale.typical_rate
-        if place.fed and place.channels:  # what comes back is no past input
-            alone = replace(modes, input_gain=modes.B[..., : place.channels], feedthrough=None)
-            return DynamicSystem(modes, past_input_covariance(alone, memory))
+        if place.fed and place.channels:
+            return DynamicSystem(modes, past_input_covariance(modes, memory, place.channels))
         return DynamicSystem(modes, memory)
 
     def static_function(

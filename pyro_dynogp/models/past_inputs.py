@@ -11,13 +11,14 @@ from pyro_dynogp.lti.covariance import real_covariance
 from pyro_dynogp.lti.modes import Modes
 
 
-def past_input_covariance(modes: Modes, memory: float) -> Tensor:
+def past_input_covariance(modes: Modes, memory: float, inputs: int | None = None) -> Tensor:
     """Covariance (*b, 2P, 2P) of [Re x; Im x] after unknown past inputs of unit variance.
 
     Each input is taken as the sum of a random constant, which holds the state at -B/lambda, and
-    of white noise of intensity 2 memory, as of an input that forgets within `memory` [s].
+    of white noise of intensity 2 memory, as of an input that forgets within `memory` [s]. Only the
+    first `inputs` count, where that is given: what a loop feeds back comes from no outside.
     """
-    lam, B = modes.poles, modes.B
+    lam, B = modes.poles, modes.B[..., :inputs]
     held = B / lam.unsqueeze(-1)
     hermitian = held @ held.mH - 2.0 * memory * (B @ B.mH) / (
         lam.unsqueeze(-1) + lam.conj().unsqueeze(-2)

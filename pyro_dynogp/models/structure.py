@@ -77,6 +77,8 @@ class Structure:
             expected = f"a whole number from {least} to {self.inputs}"
             raise invalid("direct", expected=expected, got=repr(self.direct))
         end = self.output_wire.layer  # placing the layers refuses those that do not fit together
+        if self.has_feedback:
+            _check_feedback(self.integrate, self.likelihood)
         if self.integrate == "last" and not (
             isinstance(end, Dynamic) and self.likelihood == Gaussian() and not self.direct
         ):
@@ -85,25 +87,6 @@ class Structure:
                 expected="'none' or 'all': only a dynamic last layer under constant Gaussian "
                 "noise and without direct inputs can be integrated by itself",
                 got="'last'",
-            )
-        if self.has_feedback:
-            self._check_feedback()
-
-    def _check_feedback(self) -> None:
-        """Refuse what a loop cannot do."""
-        if self.integrate != "all":
-            raise invalid(
-                "integrate",
-                expected="'all' for a model with feedback, whose trajectories depend on each other "
-                "sample by sample and cannot be sample sites",
-                got=repr(self.integrate),
-            )
-        if self.likelihood.varying and self.likelihood.of == "output":
-            raise invalid(
-                "likelihood",
-                expected="noise of constant size, or one that varies with the inputs, for a model "
-                "with feedback",
-                got=repr(self.likelihood),
             )
 
     @cached_property
@@ -218,3 +201,25 @@ class Structure:
         checked = self.check(cast(Record | Sequence[Record], records))
         scaling = self.scaling or Scaling.from_records(checked)
         return tuple(PreparedRecord.of(record, scaling) for record in checked)
+
+
+def _check_feedback(integrate: Integrate, likelihood: Likelihood) -> None:
+    """Whether a model with feedback can do with these options.
+
+    Raises:
+        ValueError: on trajectories as sites, or noise that varies with the output.
+    """
+    if integrate != "all":
+        raise invalid(
+            "integrate",
+            expected="'all' for a model with feedback, whose trajectories depend on each other "
+            "sample by sample and cannot be sample sites",
+            got=repr(integrate),
+        )
+    if likelihood.varying and likelihood.of == "output":
+        raise invalid(
+            "likelihood",
+            expected="noise of constant size, or one that varies with the inputs, for a model with "
+            "feedback",
+            got=repr(likelihood),
+        )

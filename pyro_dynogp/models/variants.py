@@ -80,24 +80,27 @@ def has_process_noise(model: Model) -> bool:
 
 
 def with_output_function(model: Model, limits: Limits | None = None) -> Model | None:
-    """The model with a static layer after its last dynamic one; None where there is one already.
+    """The model with a static layer after its last dynamic one.
 
-    Its prior mean is a straight line, to which it goes back beyond the data; or one that stops at
-    limits [output].
+    None where there is one already, or feedback. Its prior mean is a straight line, to which it
+    goes back beyond the data; or one that stops at limits [output].
     """
-    if isinstance(model.layers[-1], Static):
+    if isinstance(model.layers[-1], Static) or model.has_feedback:
         return None
     last = Static(outputs=model.outputs, inducing=INDUCING, mean="linear", limits=limits)
-    return replace(model, layers=(*model.layers, last), scaling=None)
+    return replace(model, layers=(*model.layers, last), scaling=None, output=None)
 
 
 def with_input_function(model: Model) -> Model | None:
-    """The model with a static layer before its first dynamic one; None where there is one."""
+    """The model with a static layer before its first dynamic one.
+
+    None where there is one already, or feedback.
+    """
     driving = model.inputs - model.direct
-    if isinstance(model.layers[0], Static) or not driving:
+    if isinstance(model.layers[0], Static) or model.has_feedback or not driving:
         return None
     first = Static(outputs=driving, inducing=INDUCING)
-    return replace(model, layers=(first, *model.layers), scaling=None)
+    return replace(model, layers=(first, *model.layers), scaling=None, output=None)
 
 
 def with_likelihood(model: Model, likelihood: Likelihood) -> Model:

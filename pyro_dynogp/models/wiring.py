@@ -54,8 +54,7 @@ class Static:
         kernel: a gpytorch kernel; Matern-3/2 with a lengthscale for each channel by default.
         mean: "linear" or "constant" prior mean; by default linear for a first layer, in feedback
             from several signals and where there are limits, else constant. Beyond the data a
-            function goes back to it; in feedback from one signal it keeps its value, so that what
-            comes back is bounded and free runs are.
+            function goes back to it; in feedback from one signal it goes on as its tangents.
         limits: lowest and highest value of the linear mean [output], None for none: those of a
             sensor that stops. Of a last layer of one signal and one output.
         skip: names of earlier signals that the layer sees too.
@@ -172,7 +171,8 @@ def wire(inputs: int, layers: Sequence[Layer], output: str | None = None) -> tup
             linear = place == 0 or looped or layer.limits is not None
             layer = replace(layer, mean=layer.mean or ("linear" if linear else "constant"))
             if layer.limits is not None:
-                _check_limits(name, layer, channels, name == output and name not in back)
+                end = name == output == names[-1] and name not in back
+                _check_limits(name, layer, channels, end)
         elif channels == 0 and not (layer.process_noise or layer.feedback):
             raise invalid(
                 f"process_noise of layer {name!r}",

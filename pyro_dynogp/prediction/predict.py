@@ -73,7 +73,7 @@ def _forward(
     """Outputs from a first state and the inputs."""
     found = outputs.components(samples=samples, seed=seed, several_channels=not fit.collapsed)
     if fit.model.has_feedback:
-        warn_of_divergence(fit, record, found.mean, kind)
+        warn_of_divergence(fit, record.record, found.mean, kind)
     names = fit.scaling.output_names
     return Prediction(
         record.record.time, names, found.mean, found.variance, found.noise_variance,
@@ -81,7 +81,7 @@ def _forward(
     )  # fmt: skip
 
 
-def warn_of_divergence(fit: Fitted, record: PreparedRecord, runs: np.ndarray, kind: str) -> None:
+def warn_of_divergence(fit: Fitted, record: Record, runs: np.ndarray, kind: str) -> None:
     """Warn where free runs (S, n, n_y) leave the range of the training outputs far behind."""
     known = np.concatenate([one.outputs for one in fit.records])
     low, high = np.nanmin(known, 0), np.nanmax(known, 0)
@@ -90,9 +90,9 @@ def warn_of_divergence(fit: Fitted, record: PreparedRecord, runs: np.ndarray, ki
     if left.any():
         first = int(left.any(0).argmax())
         warnings.warn(
-            f"{kind}: {left.any(1).mean():.0%} of the free runs leave the range of the training "
+            f"{kind}: {left.any(1).sum()} of {len(runs)} free runs leave the range of the training "
             f"outputs by more than {FAR:g} times its width, first at sample {first} (time "
-            f"{record.record.time[first]:.6g}). What follows is no prediction.",
+            f"{record.time[first]:.6g}). What follows is no prediction.",
             stacklevel=5,
         )
 

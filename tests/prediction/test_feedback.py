@@ -1,8 +1,6 @@
 """A fitted spring through every verb, and what feedback refuses."""
 
-import re
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +8,6 @@ import torch
 
 import pyro_dynogp as dgp
 from pyro_dynogp.inference.free_runs import free_run_error
-from pyro_dynogp.models.draws import JointState
-from pyro_dynogp.models.outputs import output_process
 from tests.models.closed_loops import spring
 
 STEP = 0.05
@@ -57,8 +53,6 @@ def test_free_runs_find_the_spring_again(fitted):
     assert not forecast.parts["process noise of g"].max() > 0.01 * sd**2
 
 
-# Unknown first states reach beyond the data, and a few runs from there do not come back.
-@pytest.mark.filterwarnings("ignore:simulation:UserWarning")
 def test_every_verb(fitted, tmp_path):
     fit, record = fitted
     train, later = record[:450], record[450:]
@@ -77,9 +71,12 @@ def test_every_verb(fitted, tmp_path):
     assert set(layers) == {"g", "f"}
     assert fit.static_function("f", train).mean.shape == (200, 1)
     assert np.isfinite(fit.log_likelihood(train)).all()
-    loo = dgp.loo(fit, train, target="missing sample", parameters="mode", progress=False)
+    loo = dgp.loo(fit, train, target="missing sample")
     assert np.isfinite(loo.elpd_loo)
-    posterior = fit.to_arviz(future=later, samples=20, prior_samples=20)
+    with pytest.warns(
+        UserWarning, match=r"simulation: \d+ of \d+ free runs leave"
+    ):  # some draws of the prior do
+        posterior = fit.to_arviz(future=later, samples=20, prior_samples=20)
     assert posterior.posterior["g_input_gain"].dims[2:] == ("pair", "g_input", "term")
     assert list(posterior.posterior["g_input"].values) == ["u", "f"]
     assert list(posterior.posterior["g_feedthrough"].dims[2:]) == ["input"]
@@ -94,42 +91,17 @@ def test_every_verb(fitted, tmp_path):
         assert np.isfinite(verb(mode).mean).all()
 
 
-def test_runs_from_far_beyond_the_data_come_back(fitted):
-    """A hundred ranges away: what comes back keeps its value there, and the poles are stable."""
-    fit, record = fitted
-    outputs = output_process(fit.at_mode().system, *fit.model.prepare(record))
-    far = JointState(torch.full((1, 2), 300.0).double(), torch.zeros(2, 2).double())
-    later = output_process(outputs.system, *fit.model.prepare(record), start=far)
-    runs = np.abs(later.components(samples=20, seed=0).mean)
-    assert runs[:, 0].min() > 100.0 * float(fit.scaling.output_scale[0])
-    assert runs[:, -1].max() < 0.2 * runs[:, 0].min()
-
-
 def test_runs_that_diverge_are_reported_where_they_do(fitted):
     fit, record = fitted
     mode = fit.at_mode()
     gain = mode.mode["g_input_gain"].clone()
-    gain[:, 1] *= -100.0  # what pulled back drives away
+    gain[:, 1] *= -20.0  # what pulled back drives away
     wild = mode.with_draws(dict(mode.draws) | {"g_input_gain": gain[None]})
     with pytest.warns(UserWarning, match=r"simulation: .* first at sample \d+ "):
         wild.simulate(record)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         fit.forecast(record[:450], record[450:])
-
-
-def test_the_page_runs():
-    page = (Path(__file__).parents[2] / "docs" / "structures.md").read_text()
-    (code,) = re.findall(r"```python\n(.*?)```", page, re.S)
-    names = {}
-    exec(code.replace("), train)", "), train, restarts=1, workers=1, progress=False)", 1), names)
-    error = names["forecast"].mean[:, 0] - names["position"][450:]
-    assert np.sqrt(np.mean(error**2)) < 0.05 * names["position"].std()
-    x, f = names["spring"].x, names["spring"].mean[:, 0]
-    bend = f - np.polyval(np.polyfit(x, f, 1), x)  # beside a line: what a cube leaves
-    cube = x**3 - np.polyval(np.polyfit(x, x**3, 1), x)
-    middle = np.abs(x) < 1.8
-    assert abs(np.corrcoef(bend[middle], cube[middle])[0, 1]) > 0.9
 
 
 def test_several_records_and_another_step():
@@ -141,20 +113,36 @@ def test_several_records_and_another_step():
     options = {"workers": 1, "progress": False, "restarts": 1, "steps": 20, "method": "map"}
     fit = dgp.fit(dgp.NonlinearFeedback(1), records, **options)
     assert {"g_initial_state_0", "g_initial_state_1"} <= set(fit.mode)
-    error = free_run_error(fit.model.collapsed, fit.mode, fit.records)
+    error = free_run_error(fit.model.collapsed, fit.mode, fit.model.prepare(fit.records))
     assert 0.0 < error < 1.0
     assert np.isfinite(fit.forecast(records[0], records[1]).mean).all()
+
+
+def test_a_loop_without_inputs():
+    """x'' - (1 - x^2) x' + x = 0, van der Pol's oscillator, by Euler's method: it swings alone."""
+    x, v, out = 0.1, 0.0, np.empty(300)
+    for k in range(300):
+        out[k] = x
+        for _ in range(10):
+            v += 0.02 * ((1.0 - x**2) * v - x)
+            x += 0.02 * v
+    record = dgp.Record(time=0.2 * np.arange(300), outputs=out)
+    options = {"workers": 1, "progress": False, "restarts": 1, "steps": 10, "method": "map"}
+    with warnings.catch_warnings():  # ten steps are too few for good free runs
+        warnings.simplefilter("ignore", UserWarning)
+        fit = dgp.fit(dgp.NonlinearFeedback(0), record[:200], **options)
+        assert fit.mode["g_input_gain"].shape == (1, 1, 2)
+        assert np.isfinite(fit.forecast(record[:200], record[200:]).mean).all()
 
 
 def test_same_bits_with_one_and_two_workers():
     record, _, _ = duffing(120, 2)
     options = {"progress": False, "restarts": 2, "steps": 6, "method": "map"}
-    fits = []
-    for workers in (1, 2):
-        # Six steps are too few to beat the linear model: two sets of starts, and a warning.
-        with pytest.warns(UserWarning, match="no better than those of the linear model"):
-            fits.append(dgp.fit(dgp.NonlinearFeedback(1), record, workers=workers, **options))
-    one, two = fits
+    with pytest.warns(UserWarning, match="no better than those of the linear model"):
+        one, two = (
+            dgp.fit(dgp.NonlinearFeedback(1), record, workers=workers, **options)
+            for workers in (1, 2)
+        )
     for name, value in one.mode.items():
         assert torch.equal(value, two.mode[name]), name
 

@@ -15,7 +15,7 @@ import numpy as np
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.density import WALL
 from pyro_dynogp.inference.fitted import Fitted
-from pyro_dynogp.inference.free_runs import NO_BETTER, better_by_free_runs, free_run_error
+from pyro_dynogp.inference.free_runs import free_run_error, noise_pays, silenced
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.optimise.gauss_newton import has_innovations
 from pyro_dynogp.inference.optimise.maximum import EFFORT, Effort, Optimizer, Optimum, maximise
@@ -46,8 +46,14 @@ STEPS: Mapping[str, int] = MappingProxyType(
 # Most starts of linear fits of each kind; iterations of those that come before cascades.
 RANDOM = 6
 LINEAR_STEPS = 40
-# Starts of a model with feedback; sets of them, until one beats the linear model in free runs.
-FEEDBACK_STARTS, ATTEMPTS = 4, 2
+# Restarts of models with feedback. Sets of them, until one beats the linear model in free runs;
+# what is said where none does.
+LOOPED = 4
+ATTEMPTS = 2
+NO_BETTER = (
+    "fit: free runs through the training record are no better than those of the linear model that "
+    "the climb began from. Try more pairs, other restarts (seed), or a longer record."
+)
 # Measurement noise, in sds of the outputs, from which starts without process noise climb at least.
 UNEXPLAINED = 0.5
 
@@ -156,7 +162,7 @@ def check_optimizer(optimizer: Optimizer | None, model: Model | None = None) -> 
 
 
 def optimizer_for(model: Model) -> Optimizer:
-    """Gauss-Newton where outputs have Gaussian innovations, Adam where functions end no loop."""
+    """Gauss-Newton for Gaussian innovations, Adam for functions that do not feed back."""
     if has_innovations(model):
         return "gauss-newton"
     return "adam" if model.has_function and not model.has_feedback else "lbfgs"
@@ -184,7 +190,7 @@ def best_optima(
         optima = maximise(problem.target, records, starts, run, steps=steps, optimizer=optimizer)
     else:
         steps = steps or 600
-        optima = climb_in_sets(problem, run, steps or 600, optimizer)
+        optima = cascade_optima(problem, run, optimizer, steps)
     if optima[0].energy >= WALL:
         raise ValueError(
             "fit: no start reached a point where the likelihood can be evaluated. Check the "
@@ -193,29 +199,32 @@ def best_optima(
     return optima
 
 
-def climb_in_sets(problem: Problem, run: Run, steps: int, optimizer: Optimizer) -> list[Optimum]:
-    """Optima from fresh starts and from what is learnt; best first.
+def cascade_optima(problem: Problem, run: Run, optimizer: Optimizer, steps: int) -> list[Optimum]:
+    """Optima of a model with static layers, best first.
 
-    With feedback another set of starts follows where free runs through the training record are no
-    better than those of the starts, from which nothing comes back as yet: of the linear model.
+    A model with feedback whose free runs are no better than those of the linear model gets another
+    set of starts, and then a warning.
     """
-    model, records, learnt = problem.target, problem.records, problem.learnt
-    usual = FEEDBACK_STARTS if model.has_feedback else 8 if model.has_function else RANDOM
+    model, records, learnt = problem.model, problem.records, problem.learnt
+    usual = LOOPED if model.has_feedback else 8 if model.has_function else RANDOM
     optima: list[Optimum] = []
     least = math.inf
-    for attempt in range(ATTEMPTS):
+    for attempt in range(ATTEMPTS if model.has_feedback else 1):
         again = replace(run, seed=run.seed + attempt)
-        starts = starting_points(model, records, again, count=run.restarts or usual, steps=steps)
-        warm = [] if learnt is None else [grown(learnt, starts[0])]
-        prefix = f"again-{attempt}-" if attempt else ""
-        found = climb(
-            model, records, starts, warm, again, steps=steps, optimizer=optimizer, prefix=prefix
+        starts = starting_points(
+            problem.target, records, again, count=run.restarts or usual, steps=steps
         )
-        optima = sorted([*optima, *found], key=lambda one: one.energy)
+        warm = [] if learnt is None else [grown(learnt, starts[0])]
+        optima += climb(
+            problem.target, records, starts, warm, again, steps=steps, optimizer=optimizer,
+            prefix=f"again-{attempt}-" if attempt else "",
+        )  # fmt: skip
         if not model.has_feedback:
             return optima
-        least = min(least, *(free_run_error(model, start, records) for start in starts))
-        if free_run_error(model, optima[0].values, records) < least:
+        optima.sort(key=lambda one: one.energy)
+        # Nothing comes back in a start: it is the linear model.
+        least = min(least, *(free_run_error(problem.target, one, records) for one in starts))
+        if free_run_error(problem.target, optima[0].values, records) < least:
             return optima
     warnings.warn(NO_BETTER, stacklevel=2)
     return optima
@@ -273,35 +282,31 @@ def climb(
 
     Args:
         model: collapsed. records: of it. starts, learnt: values of all sites. run: how.
-        steps: most of each start. optimizer, effort: of `maximise`. prefix: of the keys of pieces.
+        steps: most of each start. optimizer, effort: of climbs. prefix: of keys of checkpoints.
     """
     effort = replace(effort, kept=0.5)
 
     def optima_of(target: Model, points: Sequence[Values], key: str) -> list[Optimum]:
         return maximise(
-            target,
-            records,
-            points,
-            run,
-            optimizer=optimizer,
-            steps=steps,
-            key=prefix + key,
-            effort=effort,
+            target, records, points, run, optimizer=optimizer, steps=steps, key=key, effort=effort
         )
 
     quiet = without_noise_below_functions(model)
     better: list[Optimum] = []
     if quiet != model and starts:
         steps = max(1, steps // 2)
-        found = optima_of(quiet, [_louder(start) for start in starts], "without-process-noise")
+        key = f"{prefix}without-process-noise"
+        found = optima_of(quiet, [_louder(start) for start in starts], key)
         better = found[: (len(starts) + 1) // 2]
         starts = [grown(one.values, starts[0]) for one in better]
     elif model.has_feedback:
         starts = [_louder(start) for start in starts]
-    optima = optima_of(model, [*learnt, *starts], "cascade")
+    optima = optima_of(model, [*learnt, *starts], f"{prefix}cascade")
     if not model.has_feedback or not better:
         return optima
-    return better_by_free_runs(model, records, optima, better, starts[0])
+    prepared = model.prepare(records)
+    silent = [silenced(model, prepared, one, starts[0]) for one in better]
+    return optima if noise_pays(model, prepared, optima[0], silent[0]) else silent
 
 
 def grow(

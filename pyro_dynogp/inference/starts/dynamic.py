@@ -52,7 +52,9 @@ class DynamicStart:
         }
         layer = self.layer
         if self.one.fed:
-            values[self._key("input_gain")] = self._fed_back(values[self._key("input_gain")])
+            none = torch.zeros(layer.pairs, 0, 2, dtype=torch.float64)
+            gain = values.get(self._key("input_gain"), none)
+            values[self._key("input_gain")] = self._fed_back(gain)
         if layer.outputs > 1 and self._key("output_gain") not in values:
             # One signal is the linear fit; the others see the same modes with other gains.
             P = layer.pairs

@@ -192,16 +192,12 @@ def _linear_state(
     """Standard normal numbers (2P,) of the first state that the linear fit finds by smoothing."""
     layer = one.layer
     assert isinstance(layer, Dynamic)
-    if layer.outputs != model.outputs:
+    if layer.outputs != model.outputs or not one.channels:
         return torch.zeros(2 * layer.pairs, dtype=torch.float64)
     noisy = "g_noise_gain_unit" in linear
     alone = (replace(layer, feedback=(), process_noise=noisy),)
     twin = Model(
-        model.inputs,
-        alone,
-        direct=model.direct,
-        initial_state="integrated",
-        scaling=record.scaling,
+        model.inputs, alone, direct=model.direct, initial_state="integrated", scaling=record.scaling
     )
     with torch.no_grad():
         ((place, _),) = twin.dynamic
