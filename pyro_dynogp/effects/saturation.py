@@ -206,9 +206,9 @@ class Saturation(Effect):
         Posterior mean and standard deviation of the function [output] where it is best known of
         where it is at its limit to within a standard deviation; of the limits in the evidence.
         """
-        if not isinstance(fit.model.layers[-1], Static):
+        if not isinstance(fit.model.output_wire.layer, Static):
             return {}
-        band = fit.static_function(fit.model.wires[-1].name, record)
+        band = fit.static_function(fit.model.output_wire.name, record)
         seen = (band.x >= band.inputs.min()) & (band.x <= band.inputs.max())
         mean, sd = band.mean[seen, 0], band.sd[seen, 0]
         scale, offset = fit.scaling.output_scale[0], fit.scaling.output_offset[0]

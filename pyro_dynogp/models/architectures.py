@@ -171,7 +171,7 @@ def NonlinearFeedback(
 
     A spring or friction that is not linear, a tank that empties through a valve:
     x' = A x + B u + F f(C x), y = C x + D u, with f held from sample to sample. Beyond the data f
-    goes on as a straight line.
+    keeps its value.
 
     Args: as those of `Wiener`; f sees all outputs and has as many, the output measured is g's.
 

@@ -143,7 +143,7 @@ class _Assembler:
         self, signal: Signal, function: StaticFunction | None, last: bool, back: bool = False
     ) -> Signal:
         assert signal.rows is not None
-        # A run that leaves the data must come back: no table that ends keeps it from that.
+        # What comes back is bounded, and with it what stable dynamics make of it.
         single = back and function is not None and function.channels == 1
         ends = inducing_range(function) if single and function is not None else None
         block = Block(signal.rows, signal.known, function, last, ends)

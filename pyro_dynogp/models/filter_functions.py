@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.layers.functions import StaticFunction, even_grid
-from pyro_dynogp.moments.functions import KERNELS, TABLE, TANGENTS
+from pyro_dynogp.moments.functions import KERNELS, TABLE
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.tensors import broadcast
 
@@ -24,7 +24,8 @@ GRID = 801
 class Block:
     """One static function inside the filter: its inputs, and how it is evaluated.
 
-    ends: range beyond which a function of one channel goes on as its tangents, None for none.
+    ends: range of the table of a function of one channel, beyond which it keeps its value; None for
+        one that reaches to where the function is back at its prior mean.
     """
 
     rows: Tensor
@@ -111,7 +112,7 @@ def _function(block: Block, M: int, widest: int) -> tuple[int, dict[str, Tensor]
             values["table_variance"] = variance.mT
         values["low"] = low.unsqueeze(-1)
         values["spacing"] = ((high - low) / (GRID - 1)).unsqueeze(-1)
-        return TABLE if block.ends is None else TANGENTS, values
+        return TABLE, values
     radial = function.kernel.radial
     if radial is None:
         raise invalid(

@@ -54,7 +54,8 @@ class Static:
         kernel: a gpytorch kernel; Matern-3/2 with a lengthscale for each channel by default.
         mean: "linear" or "constant" prior mean; by default linear for a first layer, in feedback
             from several signals and where there are limits, else constant. Beyond the data a
-            function goes back to it; in feedback from one signal it goes on as its tangents.
+            function goes back to it; in feedback from one signal it keeps its value, so that what
+            comes back is bounded.
         limits: lowest and highest value of the linear mean [output], None for none: those of a
             sensor that stops. Of a last layer of one signal and one output.
         skip: names of earlier signals that the layer sees too.

@@ -1,9 +1,8 @@
 r"""Compiled evaluation of static functions inside a recursion, with derivatives.
 
 Two forms. A function of one channel is a table on an even grid, interpolated by cubic convolution
-(Keys 1981, IEEE ASSP 29:1153; the parameter -1/2), held at its ends or, in feedback, going on as
-its tangents there: any kernel fits, since the table is computed outside. A function of several
-channels is an expansion in a radial kernel,
+(Keys 1981, IEEE ASSP 29:1153; the parameter -1/2), held at its ends: any kernel fits, since the
+table is computed outside. A function of several channels is an expansion in a radial kernel,
 
     f_e(z) = constant_e + slope_e . z + sum_m weight_em kappa(r_m),
     r_m^2 = sum_c ((z_c - Z_mc) s_c)^2.
@@ -21,7 +20,7 @@ from numba import njit
 from pyro_dynogp.support.compiled import BORROWING
 
 # Forms of a static function.
-TABLE, TANGENTS = 0, -1  # held at the ends, or going on
+TABLE = 0
 KERNELS = {"rbf": 1, "matern12": 2, "matern32": 3, "matern52": 4}
 
 
@@ -72,18 +71,10 @@ def cubic(values, first, u):
 
 
 @njit(**BORROWING)
-def locate(z, low, spacing, count, form, weight, slope):
-    """Index of the first of four grid values for z; their weights, and derivatives of these by z.
-
-    Beyond the ends values are held, or go on as tangents where the form says so.
-    """
-    t = (z - low) / spacing
-    first, u, inside = place(t, count)
+def locate(z, low, spacing, count, weight, slope):
+    """Index of the first of four grid values for z; derivatives by z, zero beyond the ends."""
+    first, u, inside = place((z - low) / spacing, count)
     cubic_weights(u, weight, slope)
-    if form == TANGENTS and inside == 0.0:
-        inside = 1.0
-        for i in range(4):
-            weight[i] += (t - (first + 1 + u)) * slope[i]
     for i in range(4):
         slope[i] *= inside / spacing
     return first

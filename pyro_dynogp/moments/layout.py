@@ -20,7 +20,7 @@ class Layout(NamedTuple):
     Attributes:
         step: (n,) index of the distinct step that leads to each sample, -1 for none.
         channels, outputs: (S,) inputs d and outputs e of each static layer.
-        form: (S,) TABLE, TANGENTS or a radial kernel.
+        form: (S,) TABLE or a radial kernel.
         g_start, f_start: (S + 1,) where the layer's inputs and outputs start among all.
         nodes: (S, Q, d_max), node_weight: (S, Q), node_count: (S,).
         share, multiple: (K,) weights and variance multiples of the noise's Gaussian components.

@@ -132,14 +132,14 @@ def _average(i, layout, values, mean, block, work):
             block[a, b] = 0.0
         for c in range(d):
             cross[c, a] = 0.0
-    grid, form = values.table_mean.shape[1], layout.form[i]
+    grid = values.table_mean.shape[1]
     for q in range(layout.node_count[i]):
         xi = layout.nodes[i, q]
         wq = layout.node_weight[i, q]
         _node(i, q, layout, work)
         f = work.f[i, q]
-        if form <= TABLE:
-            k = locate(z[0], values.low[i], values.spacing[i], grid, form, weight4, slope4)
+        if layout.form[i] == TABLE:
+            k = locate(z[0], values.low[i], values.spacing[i], grid, weight4, slope4)
             for a in range(e):
                 total = 0.0
                 variance = 0.0
@@ -225,7 +225,7 @@ def _average_adjoint(i, layout, values, bars, m, m_bar, P_bar, work):
     na = values.m0.shape[0] + f0
     z, z_bar, w4, s4 = work.z, work.z_bar, work.weight4, work.slope4
     f_bar = work.f_bar[:e]
-    grid, form = values.table_mean.shape[1], layout.form[i]
+    grid = values.table_mean.shape[1]
     for q in range(layout.node_count[i]):
         xi = layout.nodes[i, q]
         wq = layout.node_weight[i, q]
@@ -239,8 +239,8 @@ def _average_adjoint(i, layout, values, bars, m, m_bar, P_bar, work):
             for b in range(e):
                 total += 2.0 * P_bar[na + a, na + b] * (f[b] - m[na + b])
             f_bar[a] = wq * total
-        if form <= TABLE:
-            k = locate(z[0], values.low[i], values.spacing[i], grid, form, w4, s4)
+        if layout.form[i] == TABLE:
+            k = locate(z[0], values.low[i], values.spacing[i], grid, w4, s4)
             for a in range(e):
                 v_bar = wq * P_bar[na + a, na + a]
                 for b in range(4):

@@ -24,12 +24,11 @@ def _evaluate(i, time, layout, values, a, z, weight, slope):
     for c in range(d):
         row = layout.g_start[i] + c
         z[c] = values.offset[time, row] + dot(values.G[row], a)
-    form = layout.form[i]
-    if form > TABLE:
-        expand(form, z[:d], expansion_of(i, layout, values), a[first : first + e])
+    if layout.form[i] != TABLE:
+        expand(layout.form[i], z[:d], expansion_of(i, layout, values), a[first : first + e])
         return
     count = values.table_mean.shape[1]
-    k = locate(z[0], values.low[i], values.spacing[i], count, form, weight, slope)
+    k = locate(z[0], values.low[i], values.spacing[i], count, weight, slope)
     for j in range(e):
         total = 0.0
         for b in range(4):

@@ -39,6 +39,8 @@ def values_of(model, record, seed=0, linear=True):
     values["g_input_gain"] = 0.4 * torch.tanh(values["g_input_gain"])
     if linear:
         values["f_values"] = torch.zeros_like(values["f_values"])
+        if "f_half_width" in values:  # a line as far as any run goes
+            values["f_half_width"] = torch.full_like(values["f_half_width"], 60.0)
         values["f_output_scale"] = 1e-13 + torch.zeros_like(values["f_output_scale"])
     return values
 

@@ -6,6 +6,8 @@ import torch
 from scipy.stats import ks_2samp
 
 from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.models.draws import JointState, Randomness, Switches
+from pyro_dynogp.models.feedback_draws import draw_outputs
 from pyro_dynogp.models.outputs import output_process
 from tests.models.closed_loops import ClosedLoop, make_record, spring, system_at, values_of
 
@@ -89,6 +91,10 @@ def test_runs_with_drawn_functions_are_those_of_a_plain_simulation():
     values["f_lengthscale"] = 1.0 + 0.0 * values["f_lengthscale"]
     values["f_half_width"] = 6.0 + 0.0 * values["f_half_width"]
     values["noise_sd"] = 0.02 + 0.0 * values["noise_sd"]
+    values["f_output_scale"] = 1.0 + 0.0 * values["f_output_scale"]
+    values["g_input_gain"][:, 1] = 0.4
+    values["g_initial_state"] = 0.1 * values["g_initial_state"]
+    values["g_noise_gain_unit"] = 0.3 * values["g_noise_gain_unit"]
     system = system_at(model, values)
     loop = ClosedLoop(model, system, record)
     function = system.layer("f").function
@@ -122,6 +128,32 @@ def test_runs_with_drawn_functions_are_those_of_a_plain_simulation():
     y = runs.mean + np.sqrt(runs.noise_variance) * rng.standard_normal(runs.mean.shape)
     for time in (5, 12, 20, 30, 39):
         assert ks_2samp(loop.scaled(y)[:, time, 0], expected[:, time]).pvalue > 0.001, time
+
+
+def test_a_function_in_feedback_keeps_its_value_beyond_its_inducing_points():
+    """In the filter's table, without variance of its own, and in runs from far away."""
+    model = spring()
+    record = make_record()
+    model = model.scaled_to(record)
+    system = system_at(model, values_of(model, record, seed=7, linear=False))
+    function = system.layer("f").function
+    ends = function.locations[[0, -1]]
+    process = output_process(system, model.prepare(record)[0])
+    problem = process.assembly.problem
+    assert not problem.table_variance.any()
+    assert float(problem.low) == pytest.approx(float(ends[0]))
+    reach = float(problem.low + problem.spacing * (problem.table_mean.shape[-1] - 1))
+    assert reach == pytest.approx(float(ends[1]))
+    held = function.mean(ends)[:, 0]
+    for at, end in ((-1e3, held[0]), (1e3, held[1])):
+        start = JointState(at * torch.tensor([[1.0, 1.0, 0.0, 0.0]]).double(), torch.zeros(4, 4))
+        off = Switches(False, frozenset(), False)
+        with torch.random.fork_rng():
+            random = Randomness.draw(system, len(record), torch.Size((1,)))
+        run = draw_outputs(system, process.grid, process.scaled_inputs, start, random, off)
+        step = float((function.mean(ends + 1e-3) - function.mean(ends))[:, 0].abs().max()) * 1e3
+        width = float(problem.spacing)
+        assert float(run.signals["f"][0, 0]) == pytest.approx(float(end), abs=2.0 * step * width)
 
 
 @pytest.mark.parametrize("outputs", [1, 2])

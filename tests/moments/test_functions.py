@@ -12,12 +12,12 @@ from pyro_dynogp.moments import functions
 from tests.moments import oracles
 
 
-def look_up(table, low, spacing, points, form=functions.TABLE):
+def look_up(table, low, spacing, points):
     """Value and derivative at each point as the filter takes them."""
     weight, slope = np.empty(4), np.empty(4)
     out = []
     for z in points:
-        k = functions.locate(z, low, spacing, len(table), form, weight, slope)
+        k = functions.locate(z, low, spacing, len(table), weight, slope)
         assert 0 <= k <= len(table) - 4
         out.append((weight @ table[k : k + 4], slope @ table[k : k + 4]))
     return np.array(out).T
@@ -64,18 +64,6 @@ def test_slopes_are_derivatives_everywhere(seed):
     plus, minus = (look_up(table, -0.8, 0.15, points + s * h)[0] for s in (1, -1))
     _, slope = look_up(table, -0.8, 0.15, points)
     np.testing.assert_allclose(slope, (plus - minus) / (2 * h), atol=1e-4)
-
-
-def test_tangents_go_on_beyond_the_ends_and_change_nothing_within():
-    table = np.arange(10.0) ** 1.5
-    inside = np.linspace(1.0, 8.0, 23)[1:]
-    same = look_up(table, 0.0, 1.0, inside, functions.TANGENTS)
-    np.testing.assert_array_equal(same, look_up(table, 0.0, 1.0, inside))
-    for end, beyond in ((1.0, -30.0), (8.0, 55.0)):
-        at, slope = look_up(table, 0.0, 1.0, np.array([end + np.sign(end - beyond) * 1e-12]))
-        value, steep = look_up(table, 0.0, 1.0, np.array([beyond]), functions.TANGENTS)
-        np.testing.assert_allclose(steep, slope, rtol=1e-10)
-        np.testing.assert_allclose(value, at + slope * (beyond - end), rtol=1e-10)
 
 
 def test_rising_table_has_positive_slope_and_ends_are_held():

@@ -8,6 +8,8 @@ import torch
 
 import pyro_dynogp as dgp
 from pyro_dynogp.inference.free_runs import free_run_error
+from pyro_dynogp.models.draws import JointState
+from pyro_dynogp.models.outputs import output_process
 from tests.models.closed_loops import spring
 
 STEP = 0.05
@@ -91,11 +93,22 @@ def test_every_verb(fitted, tmp_path):
         assert np.isfinite(verb(mode).mean).all()
 
 
+def test_runs_from_far_beyond_the_data_come_back(fitted):
+    """A hundred ranges away: what comes back keeps its value there, and the poles are stable."""
+    fit, record = fitted
+    outputs = output_process(fit.at_mode().system, fit.model.prepare(record)[0])
+    far = JointState(torch.full((1, 2), 300.0).double(), torch.zeros(2, 2).double())
+    later = output_process(outputs.system, fit.model.prepare(record)[0], start=far)
+    runs = np.abs(later.components(samples=20, seed=0).mean)
+    assert runs[:, 0].min() > 100.0 * float(fit.scaling.output_scale[0])
+    assert runs[:, -1].max() < 0.2 * runs[:, 0].min()
+
+
 def test_runs_that_diverge_are_reported_where_they_do(fitted):
     fit, record = fitted
     mode = fit.at_mode()
     gain = mode.mode["g_input_gain"].clone()
-    gain[:, 1] *= -20.0  # what pulled back drives away
+    gain[:, 1] *= -100.0  # what pulled back drives away
     wild = mode.with_draws(dict(mode.draws) | {"g_input_gain": gain[None]})
     with pytest.warns(UserWarning, match=r"simulation: .* first at sample \d+ "):
         wild.simulate(record)

@@ -40,7 +40,7 @@ def start_static(
         back = (reach - line[1]) / line[0]
         back = back[torch.isfinite(back)]
         low, high = torch.minimum(low, back.amin()), torch.maximum(high, back.amax())
-    # A function in feedback goes on from there as it ends there.
+    # A function in feedback keeps from there on the value that it has there.
     margin = (0.02 if fed_back else 0.2) * (high - low) + 1e-3
     low, high = low - margin, high + margin
     name = one.name
