@@ -60,6 +60,7 @@ if TYPE_CHECKING:  # the same names, for editors and type checkers; a test compa
     from pyro_dynogp.models.priors import TimeScale as TimeScale
     from pyro_dynogp.models.priors import sample_modes as sample_modes
     from pyro_dynogp.models.wiring import Dynamic as Dynamic
+    from pyro_dynogp.models.wiring import Known as Known
     from pyro_dynogp.models.wiring import Static as Static
     from pyro_dynogp.prediction.prediction import Prediction as Prediction
     from pyro_dynogp.prediction.scores import scores as scores
@@ -92,6 +93,7 @@ HOMES = {
     "Cascade": "models.architectures",
     "Model": "models.model",
     "Dynamic": "models.wiring",
+    "Known": "models.wiring",
     "Static": "models.wiring",
     "Gaussian": "layers.noise",
     "StudentT": "layers.noise",

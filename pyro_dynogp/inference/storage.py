@@ -25,7 +25,7 @@ from pyro_dynogp.inference.posteriors import Mixture, Posterior, Sampled
 from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.layers.sites import Values
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.wiring import Dynamic, Layer, Static
+from pyro_dynogp.models.wiring import Dynamic, Known, Layer, Static
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 
@@ -128,6 +128,13 @@ def _options(model: Model) -> dict[str, Any]:
     options = {f.name: getattr(model, f.name) for f in fields(model) if f.name != "scaling"}
     options["channels"] = [to_plain(channel) for channel in model.channels]
     for wire in model.wires:
+        if isinstance(wire.layer, Known):
+            raise invalid(
+                "save",
+                expected="layers that are numbers alone",
+                got=f"a known function in layer {wire.name!r}",
+                advice="A file holds no code: keep fit.draws and the code that makes the model.",
+            )
         if isinstance(wire.layer, Static) and wire.layer.kernel is not None:
             raise invalid(
                 "save",

@@ -6,7 +6,7 @@ import torch
 
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.lti.modes import Modes
-from pyro_dynogp.models.wiring import Dynamic, Layer
+from pyro_dynogp.models.wiring import Dynamic, Known, Layer
 
 
 def summary(fit: Fitted) -> str:
@@ -24,6 +24,10 @@ def summary(fit: Fitted) -> str:
         if len(model.wires) > 1:
             lines.append(f"layer {wire.name}:")
         lines.extend(_modes(layer.modes, unit))
+    for wire in model.wires:
+        for name in wire.layer.parameters if isinstance(wire.layer, Known) else ():
+            draws = fit.draws[f"{wire.name}_{name}"]
+            lines.append(f"{wire.name}_{name}: {float(draws.mean()):.4g}")
     if not model.likelihood.varying:
         sd = ", ".join(f"{value:.4g}" for value in fit.noise_sd)
         lines.append(f"measurement noise sd: {sd}")
@@ -34,6 +38,8 @@ def _describe(layer: Layer) -> str:
     width = f", {layer.outputs} outputs" if layer.outputs > 1 else ""
     if isinstance(layer, Dynamic):
         return f"dynamic, {layer.pairs} pairs{width}"
+    if isinstance(layer, Known):
+        return f"known function{width}"
     return f"static, {layer.inducing} inducing values{width}"
 
 

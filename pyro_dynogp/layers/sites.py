@@ -48,7 +48,8 @@ class Site:
 
         Of other distributions a draw.
         """
-        base = self.prior.base_dist if hasattr(self.prior, "base_dist") else self.prior
+        whole = torch.distributions.Independent
+        base = self.prior.base_dist if isinstance(self.prior, whole) else self.prior
         if isinstance(base, torch.distributions.LogNormal):
             return base.loc.exp().expand(self.shape).clone()
         if isinstance(base, torch.distributions.Normal):

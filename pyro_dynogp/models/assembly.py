@@ -23,6 +23,7 @@ from pyro_dynogp.lti.grid import TimeGrid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import mean_response
 from pyro_dynogp.models.filter_functions import Block, functions_of, inducing_range
+from pyro_dynogp.models.known import KnownFunction
 from pyro_dynogp.models.system import DynamicSystem, StaticSystem, System
 from pyro_dynogp.models.wiring import INPUTS, Dynamic, Wire
 from pyro_dynogp.moments.problem import FilterProblem, make_layout
@@ -140,12 +141,17 @@ class _Assembler:
         return rows
 
     def add_block(
-        self, signal: Signal, function: StaticFunction | None, last: bool, back: bool = False
+        self,
+        signal: Signal,
+        function: StaticFunction | KnownFunction | None,
+        last: bool,
+        back: bool = False,
     ) -> Signal:
         assert signal.rows is not None
         # What comes back is bounded, and with it what stable dynamics make of it.
-        single = back and function is not None and function.channels == 1
-        ends = inducing_range(function) if single and function is not None else None
+        ends = None
+        if back and isinstance(function, StaticFunction) and function.channels == 1:
+            ends = inducing_range(function)
         block = Block(signal.rows, signal.known, function, last, ends)
         self.blocks.append(block)
         first, count = self.outputs_before, block.outputs

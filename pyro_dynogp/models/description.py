@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 from pyro_dynogp.data.channels import Channel
 from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.wiring import Dynamic, Static
+from pyro_dynogp.models.wiring import Dynamic, Known, Layer
 
 
 @dataclass(frozen=True)
@@ -50,11 +50,14 @@ def describe(model: Model) -> tuple[Part, ...]:
     return (inputs, *driving, *layers, *direct, _noise(model.likelihood))
 
 
-def _layer(layer: Dynamic | Static, *, fed_back: bool) -> Part:
+def _layer(layer: Layer, *, fed_back: bool) -> Part:
     if isinstance(layer, Dynamic):
         noise = "process noise" if layer.process_noise else "no process noise"
         pairs = f"{layer.pairs} pair{'s' if layer.pairs != 1 else ''} of poles"
         return Part("dynamics", "linear dynamics", f"{pairs}, {noise}")
+    if isinstance(layer, Known):
+        heading = "known function in feedback" if fed_back else "known function"
+        return Part("function", heading, ", ".join(layer.parameters))
     limits = [f"{at:.4g}" for at in layer.limits or () if at is not None]
     stops = f", stops at {' and '.join(limits)}" if limits else ""
     heading = "static function in feedback" if fed_back else "static function"

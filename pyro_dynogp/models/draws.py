@@ -16,8 +16,9 @@ from pyro_dynogp.lti.grid import TimeGrid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import mean_response
 from pyro_dynogp.lti.state import ModalState
+from pyro_dynogp.models.known import KnownFunction
 from pyro_dynogp.models.system import DynamicSystem, StaticSystem, System, see
-from pyro_dynogp.models.wiring import INPUTS, Static
+from pyro_dynogp.models.wiring import INPUTS, Dynamic
 from pyro_dynogp.support.tensors import broadcast
 
 
@@ -106,7 +107,7 @@ class Randomness:
                     event = (n, 2 * layer.modes.pairs)
                 innovations[place.name] = torch.randn(*shape, *event, dtype=torch.float64)
             else:
-                assert isinstance(place.layer, Static)
+                assert not isinstance(place.layer, Dynamic)
                 event = (place.layer.outputs, place.layer.support)
                 residual[place.name] = torch.randn(*shape, *event, dtype=torch.float64)
         return cls(torch.randn(*shape, states, dtype=torch.float64), innovations, residual)
@@ -210,7 +211,7 @@ def draw_layers(
             if not modes.several_outputs:
                 value, mean, variance = (v.unsqueeze(-1) for v in (value, mean, variance))
         else:
-            assert isinstance(place.layer, Static)
+            assert not isinstance(place.layer, Dynamic)
             value, mean, variance = draw_static(
                 place.layer.support, layer, x, random.residual[place.name], switches
             )
@@ -228,6 +229,9 @@ def draw_static(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """One function along x, or its mean; mean and variance at each point."""
     function = layer.function
+    if isinstance(function, KnownFunction):
+        mean, variance = function.moments(x)
+        return mean, mean, variance
     support = support_points(function.locations, support_count)
     if function.channels > 1:
 

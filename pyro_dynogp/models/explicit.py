@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.distributions.process import LTIProcess
+from pyro_dynogp.models.known import KnownFunction
 from pyro_dynogp.models.output_process import OutputProcess
 from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.models.system import DynamicSystem, StaticSystem, see
@@ -53,7 +54,7 @@ def observe_explicit(
 
 def _sample_function(wire: Wire, layer: StaticSystem, x: Tensor, suffix: str) -> Tensor:
     several = wire.layer.outputs > 1
-    if wire.pathwise:
+    if wire.pathwise or isinstance(layer.function, KnownFunction):
         value = layer(x)
         value = value if several else value.squeeze(-1)
         value = pyro.deterministic(wire.name + suffix, value, event_dim=1 + several)

@@ -22,8 +22,9 @@ from pyro_dynogp.models.draws import (
     root_of,
 )
 from pyro_dynogp.models.filter_functions import Block, functions_of
+from pyro_dynogp.models.known import KnownFunction
 from pyro_dynogp.models.system import StaticSystem, System, see
-from pyro_dynogp.models.wiring import Static
+from pyro_dynogp.models.wiring import Dynamic, Static
 from pyro_dynogp.moments.problem import EVENTS, each
 from pyro_dynogp.moments.stepping import step_through
 
@@ -61,7 +62,7 @@ def draw_outputs(
     mean = signals[wire.name]
     variance = torch.zeros_like(mean)
     if isinstance(layer, StaticSystem) and not wire.pathwise:
-        assert isinstance(wire.layer, Static)
+        assert not isinstance(wire.layer, Dynamic)
         seen = see(signals, wire)
         _, mean, variance = draw_static(
             wire.layer.support, layer, seen, random.residual[wire.name], switches
@@ -109,6 +110,8 @@ def _drawn(block: Block, system: System, random: Randomness, switches: Switches)
     """The block with one draw of its function, where that is drawn."""
     function = block.function
     if function is None or block.with_variance or not switches.functions:
+        return block
+    if isinstance(function, KnownFunction):
         return block
     if function.channels > 1 and not switches.several_channels:
         return block

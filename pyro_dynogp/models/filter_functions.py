@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.layers.functions import StaticFunction, even_grid
+from pyro_dynogp.models.known import KnownFunction
 from pyro_dynogp.moments.functions import KERNELS, TABLE
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.tensors import broadcast
@@ -30,7 +31,7 @@ class Block:
 
     rows: Tensor
     known: Tensor
-    function: StaticFunction | None  # None: the identity
+    function: StaticFunction | KnownFunction | None  # None: the identity
     with_variance: bool
     ends: tuple[Tensor, Tensor] | None = None
 
@@ -42,14 +43,16 @@ class Block:
     @property
     def outputs(self) -> int:
         """Outputs of the function."""
-        return self.channels if self.function is None else int(self.function.whitened.shape[-2])
+        return self.channels if self.function is None else self.function.outputs
 
 
 def functions_of(blocks: Sequence[Block]) -> tuple[list[int], dict[str, Tensor]]:
     """Form of each static function, and the tensors that `Values` keeps of it."""
     widest = max((b.channels for b in blocks), default=1)
-    radial = [b for b in blocks if b.function is not None and b.channels > 1]
-    M = max((b.function.whitened.shape[-1] for b in radial if b.function), default=1)
+    radial = [
+        b.function for b in blocks if isinstance(b.function, StaticFunction) and b.channels > 1
+    ]
+    M = max((f.whitened.shape[-1] for f in radial), default=1)
     forms: list[int] = []
     columns: dict[str, list[Tensor]] = {}
     for block in blocks:
@@ -104,6 +107,18 @@ def _function(block: Block, M: int, widest: int) -> tuple[int, dict[str, Tensor]
     if function is None:
         values["slope"] = torch.eye(d, widest, dtype=torch.float64)
         return KERNELS["rbf"], values
+    if isinstance(function, KnownFunction):
+        if d > 1:
+            raise invalid(
+                f"layer {function.name!r}",
+                expected="one signal for a known function of what is integrated out",
+                got=f"{d} signals",
+            )
+        low, high = function.scaled_ends
+        values["table_mean"] = function.table(GRID).mT
+        values["low"] = low.unsqueeze(-1)
+        values["spacing"] = ((high - low) / (GRID - 1)).unsqueeze(-1)
+        return TABLE, values
     if d == 1:
         low, high = block.ends or table_range(function)
         mean, variance = function.moments(even_grid(low, high, GRID).unsqueeze(-1))

@@ -16,6 +16,7 @@ from pyro_dynogp.layers.functions import StaticFunction, support_points
 from pyro_dynogp.layers.sites import Site, Values, sample
 from pyro_dynogp.layers.static import StaticPrior
 from pyro_dynogp.models.explicit import observe_explicit
+from pyro_dynogp.models.known import known_function, known_sites
 from pyro_dynogp.models.limits import at_limits, log_probability_scale, scaled_limits
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.past_inputs import past_input_covariance
@@ -23,7 +24,7 @@ from pyro_dynogp.models.prepared import Records
 from pyro_dynogp.models.priors import FLAT, ModesPrior, TimeScale, direct_site
 from pyro_dynogp.models.structure import Structure
 from pyro_dynogp.models.system import DynamicSystem, StaticSystem, System
-from pyro_dynogp.models.wiring import Dynamic, Static, Wire
+from pyro_dynogp.models.wiring import Dynamic, Known, Static, Wire
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,8 @@ class Model(Structure):
         for w in self.wires:
             if isinstance(w.layer, Dynamic):
                 yield from self._modes_prior(w, w.layer, time_scale).sites(w.dims)
+            elif isinstance(w.layer, Known):
+                yield from known_sites(w.name, w.layer)
             else:
                 yield from self._static_prior(w, w.layer).sites(w.dims)
                 if self._has_residual(w):
@@ -97,7 +100,7 @@ class Model(Structure):
                     yield Site(f"{w.name}_residual", prior, dims, role="free")
         if self.direct:
             yield direct_site(self.direct, self.outputs, flat=flat)
-        if isinstance(self.output_wire.layer, Dynamic):
+        if self.measured_signal is not None:
             zero = torch.zeros(self.outputs, dtype=torch.float64)
             prior = dist.Normal(zero, zero + (FLAT if flat else 1.0)).to_event(1)
             yield Site("offset", prior, ("output",))
@@ -135,11 +138,15 @@ class Model(Structure):
         for w in self.wires:
             if isinstance(w.layer, Dynamic):
                 layers.append(self.dynamic_system(w, w.layer, values, time_scale))
+            elif isinstance(w.layer, Known):
+                layers.append(StaticSystem(known_function(self, w, w.layer, values, scaling)))
             else:
                 layers.append(self._static_system(w, w.layer, values, scaling))
         noise = self.likelihood.noise(values, self.outputs, self.inputs - self.direct)
         direct = values["direct"] if self.direct else None
-        return System(self.wires, tuple(layers), noise, values.get("offset"), direct)
+        last = isinstance(self.output_wire.layer, Dynamic)
+        offset = values["offset"] if last else None
+        return System(self.wires, tuple(layers), noise, offset, direct)
 
     def sample_system(self, scaling: Scaling) -> System:
         """Sample the parameters of all layers."""

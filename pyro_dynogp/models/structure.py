@@ -14,7 +14,7 @@ from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.layers.noise import Gaussian, Likelihood
 from pyro_dynogp.models.prepared import PreparedRecord, Records
 from pyro_dynogp.models.priors import PriorName
-from pyro_dynogp.models.wiring import Dynamic, Layer, Static, Wire, wire
+from pyro_dynogp.models.wiring import INPUTS, Dynamic, Known, Layer, StaticLayer, Wire, wire
 from pyro_dynogp.support.errors import invalid
 
 Integrate = Literal["none", "last", "all"]
@@ -100,6 +100,18 @@ class Structure:
         return next(w for w in self.wires if w.last)
 
     @property
+    def measured_signal(self) -> str | None:
+        """The signal that is in the units of the outputs, less an offset; None where there is none.
+
+        The output, if it is a dynamic layer's; what a known function sees whose output it is.
+        """
+        wire = self.output_wire
+        if isinstance(wire.layer, Dynamic):
+            return wire.name
+        sees = isinstance(wire.layer, Known) and (wire.channels, self.outputs) == (1, 1)
+        return wire.sources[0] if sees and wire.sources != (INPUTS,) else None
+
+    @property
     def has_feedback(self) -> bool:
         """Whether a static layer's output comes back to an earlier layer."""
         return any(w.feedback for w in self.wires)
@@ -122,7 +134,7 @@ class Structure:
     @property
     def has_function(self) -> bool:
         """Whether there is a static layer."""
-        return any(isinstance(layer, Static) for layer in self.layers)
+        return any(isinstance(layer, StaticLayer) for layer in self.layers)
 
     @property
     def dynamic(self) -> tuple[tuple[Wire, Dynamic], ...]:
@@ -135,7 +147,7 @@ class Structure:
         names = {
             name
             for place, reader in enumerate(self.wires)
-            if any(isinstance(w.layer, Static) for w in self.wires[place:])
+            if any(isinstance(w.layer, StaticLayer) for w in self.wires[place:])
             for name in reader.sources
         }
         return tuple(w for w, _ in self.dynamic if w.channels + w.fed and w.name in names)

@@ -17,6 +17,7 @@ from pyro_dynogp.lti.grid import TimeGrid, time_grid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import Response, mean_response
 from pyro_dynogp.lti.state import ModalState
+from pyro_dynogp.models.known import KnownFunction
 from pyro_dynogp.models.past_inputs import initial_mean, past_input_covariance, with_direct
 from pyro_dynogp.models.wiring import INPUTS, Wire
 from pyro_dynogp.support.errors import invalid
@@ -83,12 +84,12 @@ class StaticSystem:
     """A static layer given its parameters.
 
     Attributes:
-        function: the Gaussian process given its inducing values.
+        function: the Gaussian process given its inducing values, or the user's own function.
         support: (*b, K, d), residual: (*b, e, K): innovations of the rest of the function, drawn
             where the layer feeds a dynamic one and is not integrated out; else None.
     """
 
-    function: StaticFunction
+    function: StaticFunction | KnownFunction
     support: Tensor | None = None
     residual: Tensor | None = None
 
@@ -98,7 +99,11 @@ class StaticSystem:
 
     def __call__(self, x: Tensor) -> Tensor:
         """One function along x (*b, n, d): (*b, n, e)."""
-        if self.residual is None or self.support is None:
+        if (
+            isinstance(self.function, KnownFunction)
+            or self.residual is None
+            or self.support is None
+        ):
             return self.function.mean(x)
         return self.function.path(x, self.residual, self.support)
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pyro_dynogp.data.channels import Channel, count_direct
 from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.wiring import Dynamic, Limits, Static, Wire
+from pyro_dynogp.models.wiring import Dynamic, Limits, Static, StaticLayer, Wire
 
 # Inducing values of a function that is added.
 INDUCING = 32
@@ -68,7 +68,7 @@ def without_noise_below_functions(model: Model) -> Model:
 
     Layers that nothing else drives keep their process noise.
     """
-    static = [place for place, layer in enumerate(model.layers) if isinstance(layer, Static)]
+    static = [place for place, layer in enumerate(model.layers) if isinstance(layer, StaticLayer)]
     below = model.layers[: static[-1] if static else 0]
     seen = any(isinstance(layer, Dynamic) and layer.process_noise for layer in below)
     return without_process_noise(model) if seen else model
@@ -85,7 +85,7 @@ def with_output_function(model: Model, limits: Limits | None = None) -> Model | 
     None where there is one already, or feedback. Its prior mean is a straight line, to which it
     goes back beyond the data; or one that stops at limits [output].
     """
-    if isinstance(model.layers[-1], Static) or model.has_feedback:
+    if isinstance(model.layers[-1], StaticLayer) or model.has_feedback:
         return None
     last = Static(outputs=model.outputs, inducing=INDUCING, mean="linear", limits=limits)
     return replace(model, layers=(*model.layers, last), scaling=None, output=None)
@@ -97,7 +97,7 @@ def with_input_function(model: Model) -> Model | None:
     None where there is one already, or feedback.
     """
     driving = model.inputs - model.direct
-    if isinstance(model.layers[0], Static) or model.has_feedback or not driving:
+    if isinstance(model.layers[0], StaticLayer) or model.has_feedback or not driving:
         return None
     first = Static(outputs=driving, inducing=INDUCING)
     return replace(model, layers=(first, *model.layers), scaling=None, output=None)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Literal
 
+import pyro.distributions as dist
 from gpytorch.kernels import Kernel
+from torch import Tensor
 
 from pyro_dynogp.lti.modes import NoiseStructure
 from pyro_dynogp.support.errors import invalid
@@ -76,7 +78,48 @@ class Static:
     name: str | None = None
 
 
-Layer = Dynamic | Static
+@dataclass(frozen=True)
+class Known:
+    """A static layer whose function the user writes: a friction law, the root of a level.
+
+    The function sees inputs, and the output that is measured, in the units of the record; as the
+    model's output it gives that output in its units, and sees what a linear model of the record
+    would have as its own. Other signals have no unit: it sees them as they are, and what goes on
+    from it to other layers is shifted and scaled to mean zero and standard deviation one, for
+    normal signals of the size of the training record and parameters in the middle of their priors.
+    The gains of the layer that sees it take up its size and sign: leave them out of the parameters.
+
+    Args:
+        function: torch, differentiable in the parameters and, in models whose trajectories are not
+            integrated out, in the signals; finite everywhere. Called with each signal (*b, n), then
+            the parameters (*b, 1) by name; returns (*b, n), or (*b, n, outputs) for several.
+        parameters: their prior distributions by name, of pyro, of one number each: sites
+            ``<layer>_<name>``.
+        outputs: width of the layer.
+        range: beyond these values of a signal [its unit] the function keeps its value; by default 8
+            standard deviations from the mean of the training record.
+        skip: names of earlier signals that the layer sees too. More than one signal only where all
+            of them are inputs, or static functions of inputs.
+        name: prefix of its sites; f, or f1, f2, ... by default.
+
+    Example:
+        >>> import pyro.distributions as dist
+        >>> friction = Known(lambda v, w: (v / w).tanh(), {"w": dist.LogNormal(0.0, 1.0)})
+        >>> friction.outputs, sorted(friction.parameters)
+        (1, ['w'])
+    """
+
+    function: Callable[..., Tensor]
+    parameters: Mapping[str, dist.Distribution] = field(default_factory=dict)
+    outputs: int = 1
+    range: tuple[float, float] | None = None
+    skip: tuple[str, ...] = ()
+    name: str | None = None
+    support: ClassVar[int] = 0  # points at which the rest of the function is drawn
+
+
+StaticLayer = Static | Known
+Layer = Dynamic | StaticLayer
 
 
 @dataclass(frozen=True)
@@ -163,18 +206,22 @@ def wire(inputs: int, layers: Sequence[Layer], output: str | None = None) -> tup
                 )
         sources = (before, *layer.skip)
         channels = sum(width[s] for s in sources)
+        if isinstance(layer, StaticLayer) and channels == 0:
+            raise invalid(
+                f"layer {name!r}", expected="inputs for a static layer", got="no channels"
+            )
         if isinstance(layer, Static):
-            if channels == 0:
-                raise invalid(
-                    f"layer {name!r}", expected="inputs for a static layer", got="no channels"
-                )
             looped = name in back and channels > 1
             linear = place == 0 or looped or layer.limits is not None
             layer = replace(layer, mean=layer.mean or ("linear" if linear else "constant"))
             if layer.limits is not None:
                 end = name == output == names[-1] and name not in back
                 _check_limits(name, layer, channels, end)
-        elif channels == 0 and not (layer.process_noise or layer.feedback):
+        elif (
+            isinstance(layer, Dynamic)
+            and channels == 0
+            and not (layer.process_noise or layer.feedback)
+        ):
             raise invalid(
                 f"process_noise of layer {name!r}",
                 expected="True for a layer without inputs",
@@ -182,7 +229,7 @@ def wire(inputs: int, layers: Sequence[Layer], output: str | None = None) -> tup
             )
         last = name == output
         fed = sum(widths[source] for source in getattr(layer, "feedback", ()))
-        single = sum(type(other) is type(layer) for other in layers) == 1
+        single = sum(_letter(other) == _letter(layer) for other in layers) == 1
         wires.append(Wire(name, layer, sources, channels, False, last, single, fed))
         width[name] = layer.outputs
         before = name
@@ -198,16 +245,14 @@ def wire(inputs: int, layers: Sequence[Layer], output: str | None = None) -> tup
 
 
 def _names(layers: Sequence[Layer]) -> list[str]:
-    letters = {Dynamic: "g", Static: "f"}
-    kinds: list[type] = []
     for layer in layers:
-        if not isinstance(layer, Dynamic | Static):
-            raise invalid("layers", expected="Dynamic and Static layers", got=repr(layer))
-        kinds.append(type(layer))
+        if not isinstance(layer, Layer):
+            raise invalid("layers", expected="Dynamic, Static and Known layers", got=repr(layer))
+    letters = [_letter(layer) for layer in layers]
     names = []
-    for place, (kind, layer) in enumerate(zip(kinds, layers, strict=True)):
-        number = "" if kinds.count(kind) == 1 else str(kinds[: place + 1].count(kind))
-        names.append(layer.name or letters[kind] + number)
+    for place, (letter, layer) in enumerate(zip(letters, layers, strict=True)):
+        number = "" if letters.count(letter) == 1 else str(letters[: place + 1].count(letter))
+        names.append(layer.name or letter + number)
     reserved = {INPUTS, "y", "offset", "noise_sd", "log_noise"}
     if len(set(names)) < len(names) or set(names) & reserved:
         raise invalid(
@@ -218,11 +263,15 @@ def _names(layers: Sequence[Layer]) -> list[str]:
     return names
 
 
+def _letter(layer: Layer) -> str:
+    return "g" if isinstance(layer, Dynamic) else "f"
+
+
 def _check_feedback(names: Sequence[str], layers: Sequence[Layer]) -> None:
     for place, layer in enumerate(layers):
         if not isinstance(layer, Dynamic):
             continue
-        later = [n for n, other in zip(names, layers, strict=True) if isinstance(other, Static)]
+        later = [n for n, other in zip(names, layers, strict=True) if _letter(other) == "f"]
         later = [n for n in later if names.index(n) > place]
         given = layer.feedback
         if isinstance(given, str) or len(set(given)) < len(given) or not set(given) <= set(later):
@@ -260,7 +309,7 @@ def _check_layer(name: str, layer: Layer) -> None:
                 expected="'shared' or 'independent'",
                 got=repr(layer.noise),
             )
-    else:
+    elif isinstance(layer, Static):
         numbers["inducing"] = layer.inducing
         numbers["support"] = layer.support
         if layer.mean not in (None, "constant", "linear"):

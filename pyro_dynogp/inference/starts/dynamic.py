@@ -13,7 +13,7 @@ from pyro_dynogp.inference.starts.poles import random_poles
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.models.priors import TimeScale
-from pyro_dynogp.models.wiring import Dynamic, Wire
+from pyro_dynogp.models.wiring import Dynamic, Known, Wire
 
 Values = dict[str, Tensor]
 # Size of gains that are there to be learnt.
@@ -80,6 +80,9 @@ class DynamicStart:
     def _fed_back(self, gain: Tensor) -> Tensor:
         """Gains (P, d + fed, 2): what comes back acts somewhat as the inputs do, sign at random."""
         shape = (len(gain), self.one.fed, 2)
+        wires = {wire.name: wire for wire in self.model.wires}
+        if any(isinstance(wires[name].layer, Known) for name in self.one.feedback):
+            return torch.cat([gain, self._random(*shape)], 1)  # it is not nothing at first
         like = gain.mean(1, keepdim=True) if gain.shape[1] else torch.ones(shape).double()
         sign = float(self.generator.choice([-1.0, 1.0]))
         return torch.cat([gain, 0.5 * sign * like.expand(shape) + self._random(*shape)], 1)

@@ -15,10 +15,11 @@ from pyro_dynogp.inference.starts.static import start_static
 from pyro_dynogp.layers.noise import TYPICAL
 from pyro_dynogp.models.architectures import LinearDynamicGP
 from pyro_dynogp.models.assembly import assemble
+from pyro_dynogp.models.known import known_function, known_sites, middle_of
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.models.system import DynamicSystem, see
-from pyro_dynogp.models.wiring import INPUTS, Dynamic, Static, Wire
+from pyro_dynogp.models.wiring import INPUTS, Dynamic, Known, Static, Wire
 from pyro_dynogp.moments import filtering, smoothing
 from pyro_dynogp.support.parallel import child_seeds
 
@@ -131,13 +132,18 @@ def starting_point(model: Model, records: Sequence[PreparedRecord], plan: Plan) 
                 values.update(start.near_identity())
             outputs = [start.response(values, r, x) for r, x in zip(records, seen, strict=True)]
             factor = size
-            if not one.last:  # unit scale for the layer above
+            if one.name != model.measured_signal:  # unit scale for the layer above
                 factor = 1.0 / max(float(torch.cat(outputs).std()), 1e-6)
                 size = size / factor
             start.scale(values, factor)
             outputs = [o * factor for o in outputs]
+        elif isinstance(one.layer, Known):
+            for site in known_sites(one.name, one.layer):
+                values[site.name] = middle_of(site)
+            values["offset"] = level
+            function = known_function(model, one, one.layer, values, scaling)
+            outputs = [function.mean(s) for s in seen]
         else:
-            assert isinstance(one.layer, Static)
             if one.sources == (model.output_wire.name,):  # seen where it was measured
                 known = [
                     torch.where(y.isnan(), s, y - level) for y, s in zip(targets, seen, strict=True)
@@ -151,7 +157,7 @@ def starting_point(model: Model, records: Sequence[PreparedRecord], plan: Plan) 
         for signal, out in zip(signals, outputs, strict=True):
             signal[one.name] = out
     last = model.output_wire.name
-    if isinstance(model.output_wire.layer, Dynamic):
+    if model.measured_signal is not None:
         values["offset"] = level
     if plan.linear is not None and not plan.curved:
         noise = plan.linear["noise_sd"].expand(model.outputs)
