@@ -110,7 +110,7 @@ class KnownFunction:
 def known_sites(name: str, layer: Known) -> tuple[Site, ...]:
     """Sites of a known function's parameters."""
     return tuple(
-        Site(f"{name}_{parameter}", _in_double(prior, f"parameters[{parameter!r}]"), ())
+        Site(f"{name}_{parameter}", _in_double(prior, f"parameters[{parameter!r}]"), (), "free")
         for parameter, prior in layer.parameters.items()
     )
 
@@ -168,7 +168,7 @@ def _standard(f: KnownFunction) -> tuple[Tensor, Tensor]:
     value = f.mean(nodes)
     mean = weights @ value
     sd = (weights @ (value - mean).square()).sqrt()
-    if not bool((sd > 0.0).all() and sd.isfinite().all()):
+    if not bool((sd > 1e-12 * mean.abs()).all() and sd.isfinite().all()):
         raise invalid(
             f.name,
             expected="a function that is finite and changes over the range of its signals",

@@ -309,7 +309,14 @@ def _check_layer(name: str, layer: Layer) -> None:
                 expected="'shared' or 'independent'",
                 got=repr(layer.noise),
             )
-    elif isinstance(layer, Static):
+    elif isinstance(layer, Known):
+        low, high = layer.range or (0.0, 1.0)
+        if not low < high:
+            raise invalid(f"range of layer {name!r}", expected="low < high", got=f"{low}, {high}")
+        if not callable(layer.function):
+            got = repr(layer.function)
+            raise invalid(f"function of layer {name!r}", expected="a function of torch", got=got)
+    else:
         numbers["inducing"] = layer.inducing
         numbers["support"] = layer.support
         if layer.mean not in (None, "constant", "linear"):
