@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 from gpytorch.kernels import Kernel
 
 from pyro_dynogp.lti.modes import NoiseStructure
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import RULES, invalid
 
 INPUTS = "inputs"
 # Lowest and highest value, None where there is none.
@@ -250,9 +250,7 @@ def _check_that_all_matter(wires: Sequence[Wire], output: str) -> None:
 
 
 def _check_layer(name: str, layer: Layer) -> None:
-    numbers = {"outputs": layer.outputs}
     if isinstance(layer, Dynamic):
-        numbers["pairs"] = layer.pairs
         if layer.noise not in ("shared", "independent"):
             raise invalid(
                 f"noise of layer {name!r}",
@@ -260,19 +258,16 @@ def _check_layer(name: str, layer: Layer) -> None:
                 got=repr(layer.noise),
             )
     else:
-        numbers["inducing"] = layer.inducing
-        numbers["support"] = layer.support
         if layer.mean not in (None, "constant", "linear"):
             raise invalid(
                 f"mean of layer {name!r}",
                 expected="'constant' or 'linear'",
                 got=repr(layer.mean),
             )
-    for argument, value in numbers.items():
-        if not isinstance(value, int) or value < 1:
-            raise invalid(
-                f"{argument} of layer {name!r}", expected="a whole number >= 1", got=repr(value)
-            )
+    for field in fields(layer):
+        value = getattr(layer, field.name)
+        if field.name in RULES.keys() - {"skip"} and not (value is None and field.default is None):
+            RULES[field.name].check(f"{field.name} of layer {name!r}", value)
 
 
 def _check_limits(name: str, layer: Static, channels: int, last: bool) -> None:

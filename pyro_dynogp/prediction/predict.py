@@ -93,7 +93,7 @@ def warn_of_divergence(fit: Fitted, record: Record, runs: np.ndarray, kind: str)
             f"{kind}: {left.any(1).sum()} of {len(runs)} free runs leave the range of the training "
             f"outputs by more than {FAR:g} times its width, first at sample {first} (time "
             f"{record.time[first]:.6g}). What follows is no prediction.",
-            stacklevel=5,
+            stacklevel=7,
         )
 
 
@@ -102,14 +102,12 @@ def predict(
 ) -> Prediction:
     """See `Fit.predict`."""
     along = prepared(fit, record)
-    if not isinstance(horizon, int | np.integer) or horizon < 1:
-        raise invalid("horizon", expected="a whole number >= 1", got=repr(horizon))
     if not along.has_outputs:
         raise invalid("record", expected="outputs to predict from", got="none")
     y = along.observations
     with torch.no_grad():
         outputs = output_process(beginning(fit, along, predicting=True), along)
-        found = outputs.ahead(y, int(horizon))
+        found = outputs.ahead(y, horizon)
         mean, variance = flat(found.mean), flat(found.variance)
         noise = flat((outputs.scale * outputs.noise_sd).square())
     noise = np.broadcast_to(noise, mean.shape)
@@ -127,7 +125,7 @@ def predict(
     def draw() -> np.ndarray:
         if joint:
             with torch.no_grad(), seeded(seed):
-                errors = outputs.prediction_errors(y, int(horizon), -(-samples // len(mean)))
+                errors = outputs.prediction_errors(y, horizon, -(-samples // len(mean)))
             if errors is not None:
                 return spread_evenly(mean + errors.numpy(), samples)
         generator = np.random.default_rng(seed)

@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.prediction.mixture_score import mixture_scores
 from pyro_dynogp.prediction.prediction import Prediction
 from pyro_dynogp.support.errors import invalid
 
 
+@isolated
 def scores(prediction: Prediction, record: Record, skip: int = 0) -> dict[str, Any]:
     """Compare a prediction with the outputs of a record.
 

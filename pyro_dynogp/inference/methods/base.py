@@ -57,14 +57,6 @@ class Problem:
         """In whose units the model is fitted."""
         return self.records[0].scaling
 
-    @property
-    def identity(self) -> tuple[object, ...]:
-        """Everything that changes the result, with the same `repr` in every process."""
-        own = (self.model, [each.record.fingerprint for each in self.records])
-        if self.learnt is None:
-            return own
-        return (*own, {name: value.tolist() for name, value in self.learnt.items()})
-
     def fitted(
         self,
         run: Run,
@@ -83,7 +75,7 @@ class Problem:
 
 
 class Method(Protocol):
-    """A method of inference. Its options are its fields."""
+    """A method of inference. Its options are its fields, and make checkpoints of it its own."""
 
     def check(self, model: Model, *, warm: bool) -> None:
         """Refuse a model that the method cannot fit, before any work.
@@ -94,11 +86,6 @@ class Method(Protocol):
         Raises:
             ValueError: where the two do not go together.
         """
-        ...
-
-    @property
-    def identity(self) -> object:
-        """Everything that changes the result, with the same `repr` in every process."""
         ...
 
     def __call__(self, problem: Problem, run: Run) -> Fitted:
