@@ -21,6 +21,7 @@ from pyro_dynogp.inference.summary import summary
 from pyro_dynogp.inference.training import train_model
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.outputs import output_process
+from pyro_dynogp.models.prepared import with_outputs
 from pyro_dynogp.prediction import layers as _layers
 from pyro_dynogp.prediction import predict as _predict
 from pyro_dynogp.prediction.first_state import beginning
@@ -62,7 +63,7 @@ class Fit(Fitted):
         """Log p(y | draw) (S,) [nats], exact marginal likelihood in the units of the record."""
         total = torch.zeros((), dtype=torch.float64)
         with torch.no_grad():
-            for record in self.model.prepare(records):
+            for record in with_outputs(self.model.prepare(records)):
                 outputs = output_process(beginning(self, record), record)
                 total = total + outputs.log_prob(record.observations)
         return total.numpy()

@@ -271,4 +271,5 @@ def mix(predictions: Sequence[Prediction], weights: np.ndarray) -> Prediction:
         draw,
         kind,
         component_weights,
+        first.output_units,
     )

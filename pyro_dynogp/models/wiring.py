@@ -266,7 +266,7 @@ def _check_layer(name: str, layer: Layer) -> None:
             )
     for field in fields(layer):
         value = getattr(layer, field.name)
-        if field.name in RULES.keys() - {"skip"} and not (value is None and field.default is None):
+        if field.name in RULES and not (value is None and field.default is None):
             RULES[field.name].check(f"{field.name} of layer {name!r}", value)
 
 

@@ -98,7 +98,7 @@ RULES = {
     **dict.fromkeys(("draws", "samples", "particles", "chains", "warmup", "restarts", "steps",
                      "horizon", "points", "workers", "max_rounds", "tries", "channels", "outputs",
                      "inducing", "support", "pairs", "brownian"), COUNT),
-    **dict.fromkeys(("skip", "prior_samples", "refits", "channel", "inputs", "fed"), NUMBER),
+    **dict.fromkeys(("prior_samples", "refits", "channel", "inputs", "fed"), NUMBER),
     **dict.fromkeys(("progress", "process_noise", "feedthrough", "learn_locations"), SWITCH),
     "seed": Rule("a whole number from 0 to 2**63 - 1", whole(0, 2**63 - 1).plain),
     "level": SHARE,
