@@ -16,7 +16,11 @@ from pyro_dynogp.inference.posteriors import Posterior
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord, as_measured
+from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
+
+# Samples below which a record has no time scale.
+FEWEST = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +46,10 @@ class Problem:
             ValueError: as of `Model.check`; on constant or entirely missing signals.
         """
         checked = model.check(records)
+        longest = max(map(len, checked))
+        if longest < FEWEST:
+            expected = f"a record of {FEWEST} samples or more to fit to"
+            raise invalid("record", expected=expected, got=f"{longest} samples")
         scaling = Scaling.from_records(checked)
         prepared = tuple(PreparedRecord.of(record, scaling) for record in checked)
         learnt = None if start is None else dict(start.mode)
