@@ -13,6 +13,7 @@ from pyro_dynogp.criticism import inference_data
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference import storage
 from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.inference.methods.base import Method, Problem
 from pyro_dynogp.inference.methods.choose import method_of
 from pyro_dynogp.inference.run import Run
@@ -20,6 +21,7 @@ from pyro_dynogp.inference.summary import summary
 from pyro_dynogp.inference.training import train_model
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.outputs import output_process
+from pyro_dynogp.models.prepared import with_outputs
 from pyro_dynogp.prediction import layers as _layers
 from pyro_dynogp.prediction import predict as _predict
 from pyro_dynogp.prediction.first_state import beginning
@@ -35,6 +37,7 @@ class Fit(Fitted):
     The attributes are those of `Fitted`.
     """
 
+    @isolated
     def layers(self, record: Record) -> Mapping[str, LayerTrajectory]:
         """Posterior trajectories of all layers along a record, given its inputs and outputs.
 
@@ -43,6 +46,7 @@ class Fit(Fitted):
         """
         return _layers.layers(self, record)
 
+    @isolated
     def static_function(
         self, name: str, record: Record, *, channel: int = 0, points: int = 200
     ) -> StaticBand:
@@ -54,15 +58,17 @@ class Fit(Fitted):
         """
         return _layers.static_function(self, name, record, channel, points)
 
+    @isolated
     def log_likelihood(self, records: Record | Sequence[Record]) -> np.ndarray:
         """Log p(y | draw) (S,) [nats], exact marginal likelihood in the units of the record."""
         total = torch.zeros((), dtype=torch.float64)
         with torch.no_grad():
-            for record in self.model.prepare(records):
+            for record in with_outputs(self.model.prepare(records)):
                 outputs = output_process(beginning(self, record), record)
                 total = total + outputs.log_prob(record.observations)
         return total.numpy()
 
+    @isolated
     def simulate(
         self, record: Record, *, process_noise: bool = True, samples: int = 200, seed: int = 0
     ) -> Prediction:
@@ -75,6 +81,7 @@ class Fit(Fitted):
         """
         return _predict.simulate(self, record, process_noise, samples, seed)
 
+    @isolated
     def predict(
         self, record: Record, *, horizon: int = 1, samples: int = 200, seed: int = 0
     ) -> Prediction:
@@ -86,6 +93,7 @@ class Fit(Fitted):
         """
         return _predict.predict(self, record, horizon, samples, seed)
 
+    @isolated
     def forecast(
         self,
         past: Record,
@@ -104,6 +112,7 @@ class Fit(Fitted):
         """
         return _predict.forecast(self, past, future, process_noise, samples, seed)
 
+    @isolated
     def innovations(self, record: Record) -> np.ndarray:
         """Standardised one-step prediction errors (n, n_y); NaN where the output is missing.
 
@@ -112,6 +121,7 @@ class Fit(Fitted):
         """
         return self.predict(record, horizon=1).normal_scores(record.outputs)
 
+    @isolated
     def save(self, path: str | Path) -> None:
         """Write the fit to one safetensors file, from which `pyro_dynogp.load` restores it.
 
@@ -124,6 +134,7 @@ class Fit(Fitted):
         """
         storage.save(self, path)
 
+    @isolated
     def to_arviz(
         self,
         *,
@@ -171,11 +182,13 @@ class Fit(Fitted):
             self, future=future, samples=samples, prior_samples=prior_samples, seed=seed
         )
 
+    @isolated
     def summary(self) -> str:
         """A few lines: what was fitted, how well it went, the modes at the best optimum."""
         return summary(self)
 
 
+@isolated
 def fit(
     model: Model,
     record: Record | Sequence[Record],
@@ -232,6 +245,7 @@ def fit(
     return Fit.of(train_model(problem, chosen, run, checkpoint))
 
 
+@isolated
 def load(path: str | Path) -> Fit:
     """Read a fit that `Fit.save` wrote.
 

@@ -1,7 +1,10 @@
 """Command line, end to end: what is printed, written and refused, and the exit codes."""
 
 import dataclasses
+import gzip
 import json
+import lzma
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -378,3 +381,68 @@ def test_demo_command(tmp_path, monkeypatch):
     assert seen == {"at": tmp_path / "x", "progress": False}
     assert run("demo").exit_code == 0
     assert seen == {"at": Path("demo_output"), "progress": True}
+
+
+def test_what_is_too_short_to_fit_ends_in_a_sentence(folder):
+    refused(run("fit", folder / "plant.csv", *COLUMNS, "--train", 2, *QUICK), "3 samples or more")
+
+
+def test_damaged_files_end_in_a_sentence(tmp_path):
+    whole = gzip.compress(b"a,b\n" + b"1,2\n" * 500)
+    cases = {
+        "short.csv.gz": (whole[:-20], "a whole compressed file"),
+        "other.csv.gz": (b"a,b\n1,2\n", "a whole compressed file"),
+        "flipped.csv.gz": (whole[:20] + bytes([whole[20] ^ 255]) + whole[21:], "compressed file"),
+        "short.csv.xz": (lzma.compress(b"a,b\n1,2\n")[:-20], "a whole compressed file"),
+        "other.csv.bz2": (b"a,b\n1,2\n", "a whole compressed file"),
+        "quoted.csv": (b'a,b\n"' + b"1" * 140_000 + b'",2\n', "field larger than field limit"),
+        "long.csv": (b"a,b\n" + b"1" * 2_000_000 + b",2\n", "fewer than 1048576 characters"),
+    }
+    for name, (content, expected) in cases.items():
+        (tmp_path / name).write_bytes(content)
+        refused(run("info", tmp_path / name), expected)
+
+
+BLANK = """
+import resource, sys
+from pathlib import Path
+from pyro_dynogp.data.text_table import read_table
+
+def most():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+before = most()
+read_table(Path(sys.argv[1]), None, None, None, None, "utf-8")
+print(most() - before)
+"""
+
+
+def test_blank_lines_take_no_memory(tmp_path):
+    """4 MB of blank lines, 4 kB compressed, in a process of its own."""
+    path = tmp_path / "blank.csv.gz"
+    path.write_bytes(gzip.compress(b"a,b\n1,2\n" + b"\n" * 4_000_000))
+    command = [sys.executable, "-c", BLANK, path]
+    grown = subprocess.run(command, capture_output=True, check=True, cwd=Path(__file__).parents[1])
+    assert int(grown.stdout) < 8_000  # kB; a list of the lines took 160 MB
+
+
+def test_a_fit_that_cannot_be_saved_is_saved_elsewhere(folder, tmp_path, monkeypatch):
+    """The folder is tried before the work; what happens to it meanwhile loses nothing."""
+    for path in ("/proc/fit.safetensors", "/proc/absent/fit.safetensors"):
+        refused(run("fit", folder / "plant.csv", *COLUMNS, "--save", path, *QUICK), "--save: ")
+    target = tmp_path / "there" / "fit.safetensors"
+    target.parent.mkdir()
+    fit = dgp.fit
+
+    def fit_and_lose_the_folder(*arguments, **options):
+        found = fit(*arguments, **options)
+        target.parent.rmdir()
+        return found
+
+    monkeypatch.setattr(dgp, "fit", fit_and_lose_the_folder)
+    done = run("fit", folder / "plant.csv", *COLUMNS, "--save", target, *QUICK)
+    assert done.exit_code == 0
+    assert "Saved elsewhere" in done.stderr
+    other = Path(done.stdout.split("saved to ")[1].split("\n")[0])
+    assert dgp.load(other).method == "map"
+    shutil.rmtree(other.parent)

@@ -190,9 +190,9 @@ def test_prediction_on_dates(map_fit):
 
 def test_prediction_refuses(fit, record):
     made = fit.simulate(record)
-    with refused("record", "120 times", "60 times"):
+    with refused("prediction", "60 times", "120 times"):
         plotting.prediction(made, record[:60])
-    with refused("record", "other times of the same number"):
+    with refused("prediction", "other times of the same number"):
         plotting.prediction(made, dataclasses.replace(record, time=record.time + 1))
     with refused("skip", "0 to 119", "120"):
         plotting.prediction(made, record, skip=120)

@@ -12,6 +12,7 @@ import click
 
 from pyro_dynogp.cli.close_loop import close_loop
 from pyro_dynogp.cli.data import Clock, Columns, InvalidInput, record_for, training_and_test
+from pyro_dynogp.cli.files import check_folder, saved
 from pyro_dynogp.cli.options import CHANNELS, CLOCK, PAIRS, WORK, seed
 
 
@@ -26,9 +27,10 @@ class _Group(click.Group):
                 raise
             raise InvalidInput(" ".join(str(error).split())) from error
         except OSError as error:
-            if error.filename is None:
+            if error.filename is None and not _from_package(error):
                 raise
-            raise InvalidInput(f"{error.filename}: {error.strerror}.") from error
+            where = "" if error.filename is None else f"{error.filename}: "
+            raise InvalidInput(f"{where}{error.strerror}.") from error
 
 
 def _from_package(error: BaseException) -> bool:
@@ -38,13 +40,6 @@ def _from_package(error: BaseException) -> bool:
         trace = trace.tb_next
     module = "" if trace is None else str(trace.tb_frame.f_globals.get("__name__", ""))
     return module == "pyro_dynogp" or module.startswith("pyro_dynogp.")
-
-
-def _check_folder(option: str, path: Path) -> None:
-    """Tell what cannot be written before the work, not after it."""
-    folder = path.absolute().parent
-    if not folder.is_dir():
-        raise InvalidInput(f"{option}: there is no folder {folder}.")
 
 
 _PLAIN = {"context_settings": {"help_option_names": ["-h", "--help"], "max_content_width": 100}}
@@ -163,9 +158,10 @@ def fit(
     from pyro_dynogp.cli import demonstration as report
 
     if save is not None:
-        _check_folder("--save", save)
+        check_folder("--save", save)
     if figures is not None:
         figures.mkdir(parents=True, exist_ok=True)
+        check_folder("--figures", figures / "record.png")
     parts = training_and_test(data, columns, train)
     first, test = parts.train[0], parts.test
     model = dgp.LinearDynamicGP(inputs=first.n_inputs, outputs=first.n_outputs, pairs=pairs)
@@ -181,8 +177,7 @@ def fit(
     )
     click.echo(fitted.summary())
     if save is not None:
-        fitted.save(save)
-        click.echo(f"saved to {save}")
+        click.echo(f"saved to {saved(fitted, save)}")
     results = None
     if test is not None:
         past = first if parts.follows else None
@@ -231,7 +226,7 @@ def simulate(
     """  # noqa: D301
     if horizon is not None and no_process_noise:
         raise InvalidInput("--no-process-noise: for simulations; leave it out with --horizon.")
-    _check_folder("--out", out)
+    check_folder("--out", out)
     from pyro_dynogp import load
 
     fitted = load(model)

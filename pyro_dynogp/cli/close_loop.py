@@ -8,6 +8,7 @@ from typing import Unpack
 import click
 
 from pyro_dynogp.cli.data import Columns, InvalidInput, whole_record
+from pyro_dynogp.cli.files import check_folder, saved
 from pyro_dynogp.cli.options import CHANNELS, PAIRS, WORK, seed
 
 
@@ -72,6 +73,7 @@ def close_loop(
     if len(record) < fewest:
         raise InvalidInput(f"{data}: has {len(record)} samples; {fewest} are needed.")
     out.mkdir(parents=True, exist_ok=True)
+    check_folder("--out", out / "report.html")
     if left_out:
         click.echo(f"Left out, as they hold no numbers: {', '.join(left_out)}", err=True)
     made = dgp.LinearDynamicGP if kind == "linear" else dgp.Wiener
@@ -96,6 +98,6 @@ def close_loop(
     click.echo(str(report))
     report.to_html(out / "report.html")
     report.to_json(out / "report.json")
-    report.fit.save(out / "model.safetensors")
+    model = saved(report.fit, out / "model.safetensors")
     click.echo(f"\nReport: {out / 'report.html'} (numbers: {out / 'report.json'})")
-    click.echo(f"Model:  {out / 'model.safetensors'} (pyro_dynogp.load reads it)")
+    click.echo(f"Model:  {model} (pyro_dynogp.load reads it)")

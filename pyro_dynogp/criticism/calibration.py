@@ -13,6 +13,7 @@ from pyro_dynogp.criticism.crps import CrpsDecomposition, decomposition
 from pyro_dynogp.criticism.pairing import Pair, paired
 from pyro_dynogp.criticism.probability_integral import LEVELS, NOMINAL, PitCurves, pit_curves
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.prediction.prediction import Prediction
 from pyro_dynogp.support.errors import invalid
 
@@ -169,6 +170,7 @@ class Calibration:
         return "\n".join([title, table, self.verdict, *([self.note] if self.note else [])])
 
 
+@isolated
 def calibration(
     prediction: Prediction, record: Record, *, skip: int = 0, level: float = 0.95, seed: int = 0
 ) -> Calibration:

@@ -14,6 +14,7 @@ from pyro_dynogp.criticism.calibration import calibration
 from pyro_dynogp.criticism.finding import Finding, apart
 from pyro_dynogp.criticism.posterior_draws import DRAWS, PosteriorDraws, draws_of, log_joint_of
 from pyro_dynogp.criticism.twin import twin_findings
+from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.prediction.predict import predict
 from pyro_dynogp.support.errors import invalid
 
@@ -66,6 +67,7 @@ class Check:
         return "\n".join([f"Check of a fit by {self.method}", *lines, self.verdict])
 
 
+@isolated
 def check(
     fit: Fitted,
     *,

@@ -12,6 +12,7 @@ import pandas as pd
 from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.loo import Target, loo
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.prediction import predict as predicting
 from pyro_dynogp.prediction.prediction import Parts, Prediction
 from pyro_dynogp.support.errors import invalid
@@ -72,6 +73,7 @@ class Comparison:
         return f"{self.table.to_string(float_format=lambda x: f'{x:.3g}')}\n{self.verdict}"
 
 
+@isolated
 def compare(
     models: Mapping[str, Fitted | Any], *, target: Target, method: str = "stacking", **options: Any
 ) -> Comparison:
@@ -194,6 +196,7 @@ class Stack:
         return mix(predictions, weights)
 
 
+@isolated
 def stack(
     fits: Mapping[str, Fitted], weights: Comparison | Mapping[str, float] | None = None,
     *, target: Target | None = None, **options: Any,
@@ -268,4 +271,5 @@ def mix(predictions: Sequence[Prediction], weights: np.ndarray) -> Prediction:
         draw,
         kind,
         component_weights,
+        first.output_units,
     )

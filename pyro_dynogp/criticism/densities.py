@@ -20,7 +20,7 @@ from pyro_dynogp.distributions import pointwise
 from pyro_dynogp.distributions.pointwise import Moments
 from pyro_dynogp.distributions.process import ObservedLTIProcess
 from pyro_dynogp.models.output_process import OutputProcess
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import invalid, verify
 
 Kind = Literal["missing sample", "forecast"]
 
@@ -45,8 +45,7 @@ def pointwise_log_density(
     """
     if kind not in ("missing sample", "forecast"):
         raise invalid("kind", expected="'missing sample' or 'forecast'", got=repr(kind))
-    if not isinstance(horizon, int) or horizon < 1:
-        raise invalid("horizon", expected="a whole number >= 1", got=repr(horizon))
+    verify(horizon=horizon)
     with torch.no_grad():
         if isinstance(observed, OutputProcess):
             density = _of_outputs(observed, outputs, kind, horizon).log_density

@@ -20,6 +20,7 @@ from pyro_dynogp.criticism.pyro_draws import (
 )
 from pyro_dynogp.criticism.pyro_posterior import PyroPosterior
 from pyro_dynogp.criticism.site_densities import is_masked, is_trajectory
+from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.layers.sites import Arguments, Program
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.parallel import seeded
@@ -27,6 +28,7 @@ from pyro_dynogp.support.parallel import seeded
 __all__ = ["PyroPosterior", "from_pyro"]
 
 
+@isolated
 def from_pyro(
     model: Program,
     posterior: Any,
@@ -58,8 +60,6 @@ def from_pyro(
         ValueError: on subsampled plates, sites without a draw, draws without a site, a model that
             observes nothing, or trajectories with a mask (mark missing samples by NaN).
     """
-    if not isinstance(draws, int) or draws < 1:
-        raise invalid("draws", expected="a whole number >= 1", got=repr(draws))
     if not callable(model):
         raise invalid("model", expected="a Pyro model", got=type(model).__name__)
     if observed is not None:

@@ -29,7 +29,6 @@ from pyro_dynogp.models.output_process import OutputProcess
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.prediction.first_state import beginning
 from pyro_dynogp.prediction.predict import forecast, simulate
-from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.parallel import seeded
 from pyro_dynogp.support.version import __version__
 
@@ -52,9 +51,6 @@ def to_arviz(
     seed: int = 0,
 ) -> Any:
     """ArviZ's InferenceData of a fit; see `Fit.to_arviz`."""
-    for name, count, least in (("samples", samples, 1), ("prior_samples", prior_samples, 0)):
-        if not isinstance(count, int) or count < least:
-            raise invalid(name, expected=f"a whole number >= {least}", got=repr(count))
     export = _Export(fit, samples, seed)
     groups: dict[str, xr.Dataset] = {}
     if future is not None:  # first: this is where a record may be refused

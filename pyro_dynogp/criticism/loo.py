@@ -13,6 +13,7 @@ from pyro_dynogp.criticism.posterior_draws import DRAWS
 from pyro_dynogp.criticism.subjects import FitSubject, Parameters, Subject
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.records import as_records
+from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ TARGETS = get_args(Target)
 MOST_REFITS = 30
 
 
+@isolated
 def loo(
     fit: Fitted | Subject,
     record: Record | Sequence[Record] | None = None,
@@ -88,8 +90,6 @@ def loo(
             got=repr(target),
             advice="Name what the model is for: filling gaps, forecasting, or new experiments.",
         )
-    if not isinstance(refits, int) or refits < 0:
-        raise invalid("refits", expected="a whole number >= 0", got=repr(refits))
     subject = subject_of(fit, record, draws, seed, parameters, progress)
     if target == "missing sample":
         found = missing_sample(subject, refits, workers, progress)

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.data.records import one_record
 from pyro_dynogp.prediction.prediction import Prediction
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import invalid, whole
 
 FEWEST_SAMPLES = 50  # with fewer the p-value is too coarse for a level of 5 %
 
@@ -38,11 +37,8 @@ def paired(prediction: Prediction, record: Record, skip: int) -> Pair:
             measured samples; too few joint samples, or samples of another shape.
     """
     _check_types(prediction, record)
-    _check_times(prediction, record)
     n = len(record)
-    whole = isinstance(skip, (int, np.integer)) and not isinstance(skip, bool)
-    if not whole or not 0 <= skip < n:
-        raise invalid("skip", expected=f"a whole number from 0 to {n - 1}", got=repr(skip))
+    skip = whole(0, n - 1).check("skip", skip)
     outputs = np.array(record.outputs, dtype=np.float64)
     outputs[:skip] = np.nan
     absent = ~np.isfinite(outputs)
@@ -81,25 +77,7 @@ def _check_types(prediction: Prediction, record: Record) -> None:
             got=type(prediction).__name__,
             advice="Make one with fit.predict, fit.simulate or fit.forecast.",
         )
-    one_record(record, "Compare several records one after the other.")
-
-
-def _check_times(prediction: Prediction, record: Record) -> None:
-    if not np.array_equal(prediction.time, record.time):
-        same = len(prediction) == len(record)
-        raise invalid(
-            "prediction",
-            expected=f"the {len(record)} times of the record",
-            got="other times of the same number" if same else f"{len(prediction)} times",
-            advice="Compare a prediction with the record that it was made for.",
-        )
-    if tuple(prediction.output_names) != record.output_names:
-        raise invalid(
-            "record",
-            expected=f"the predicted outputs {list(prediction.output_names)}",
-            got=f"{list(record.output_names)}",
-            advice="Compare a prediction with the record that it was made for.",
-        )
+    prediction.check(record)
 
 
 def _note(kind: str) -> str:

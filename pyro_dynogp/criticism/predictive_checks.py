@@ -12,6 +12,7 @@ from pyro_dynogp.criticism.envelope import envelope
 from pyro_dynogp.criticism.pairing import Pair, paired
 from pyro_dynogp.criticism.statistics import STATISTICS, Statistic, unit
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.prediction.prediction import Prediction
 from pyro_dynogp.support.errors import invalid
 
@@ -97,6 +98,7 @@ class PredictiveChecks:
         return "\n".join([title, table, self.verdict, *([self.note] if self.note else [])])
 
 
+@isolated
 def predictive_checks(
     prediction: Prediction,
     record: Record,

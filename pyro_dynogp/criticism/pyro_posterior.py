@@ -25,7 +25,7 @@ from pyro_dynogp.criticism.site_densities import (
 )
 from pyro_dynogp.criticism.site_dimensions import dimensions_for
 from pyro_dynogp.criticism.subjects import Subject, fingerprint_of, no_refit
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import invalid, verify
 from pyro_dynogp.support.parallel import seeded
 from pyro_dynogp.support.version import __version__
 
@@ -78,8 +78,7 @@ class PyroPosterior:
         """
         if kind not in get_args(Kind):
             raise invalid("kind", expected=f"one of {list(get_args(Kind))}", got=repr(kind))
-        if not isinstance(horizon, int) or horizon < 1:
-            raise invalid("horizon", expected="a whole number >= 1", got=repr(horizon))
+        verify(horizon=horizon)
         parts = []
         for name, value in self.observed.items():
             if self.trajectories and is_integrated(self.sites[name][0]):

@@ -16,6 +16,7 @@ from pyro_dynogp.criticism.rank_results import SimulationBasedCalibration, judge
 from pyro_dynogp.criticism.ranks import rank_of
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.records import one_record
+from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.inference.methods.base import Method, Problem
 from pyro_dynogp.inference.methods.choose import method_of
 from pyro_dynogp.inference.run import Run
@@ -60,6 +61,7 @@ class _Outcome:
     effective: float
 
 
+@isolated
 def simulation_based_calibration(
     model: Model,
     record: Record,

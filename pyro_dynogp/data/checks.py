@@ -17,6 +17,8 @@ from pyro_dynogp.support.errors import invalid
 
 Array = NDArray[np.float64]
 Names = str | Sequence[str] | None
+# Seconds from 1970 to the last stamp in nanoseconds, rounded down.
+LATEST = 2**63 / 1e9 - 1.0
 
 
 def frozen(array: Array) -> Array:
@@ -194,6 +196,11 @@ def read_clock(time: Any, start: Any, time_unit: str) -> tuple[Array, pd.Timesta
     if not np.isfinite(clock).all():
         row = int(np.flatnonzero(~np.isfinite(clock))[0])
         raise invalid("time", expected="finite numbers", got=f"{clock[row]} in row {row}")
+    if origin is not None and np.abs(clock + nanoseconds(origin) / 1e9).max() > LATEST:
+        raise invalid(
+            "time", expected="instants from 1677 to 2262, which stamps can name",
+            got=f"{clock[0]:g} to {clock[-1]:g} s after {origin}",
+        )  # fmt: skip
     steps = np.diff(clock)
     if (steps <= 0).any():
         k = int(np.flatnonzero(steps <= 0)[0])

@@ -6,9 +6,11 @@ import bz2
 import csv
 import dataclasses
 import gzip
+import itertools
 import lzma
 import re
-from collections.abc import Callable, Mapping, Sequence
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ import pandas as pd
 from pyro_dynogp.data.checks import Array
 from pyro_dynogp.support.errors import invalid
 
+LONGEST_LINE = 2**20  # characters: what is longer is no table
 MISSING = ("", "na", "n/a", "nan", "null")
 _OPENERS: dict[str, Callable[..., Any]] = {".gz": gzip.open, ".xz": lzma.open, ".bz2": bz2.open}
 _STAMP = re.compile(
@@ -74,15 +77,7 @@ def read_table(
     delimiter: str | None, decimal: str | None, encoding: str,
 ) -> TextTable:  # fmt: skip
     """A table of a text file: columns by name."""
-    try:
-        with _OPENERS.get(path.suffix, open)(path, "rt", encoding=encoding) as file:
-            numbered = [(i, text.strip("\r\n ")) for i, text in enumerate(file, start=1)]
-    except UnicodeDecodeError as error:
-        raise invalid(
-            "encoding", expected=f"a text file in {encoding}", got=str(error),
-            advice='Give the encoding, for instance encoding="latin-1".',
-        ) from error  # fmt: skip
-    numbered = [(i, text) for i, text in numbered if text.strip() and text.lstrip()[0] not in "#%"]
+    numbered = list(_lines(path, encoding))
     if not numbered:
         raise invalid("path", expected="a file with a line of data", got=f"{path}, which has none")
     if delimiter is not None and len(delimiter) != 1:
@@ -92,9 +87,14 @@ def read_table(
     mark = delimiter or _sniff([text for _, text in numbered[:50]])
     if mark.isspace() and mark != "\t":
         numbered = [(i, " ".join(text.split())) for i, text in numbered]
-    rows = [
-        [c.strip() for c in row] for row in csv.reader((t for _, t in numbered), delimiter=mark)
-    ]
+    try:
+        found = csv.reader((text for _, text in numbered), delimiter=mark)
+        rows = [[cell.strip() for cell in row] for row in found]
+    except csv.Error as error:
+        raise invalid(
+            "path", expected="a file of columns", got=f"{path}, in which a {error}",
+            advice="A quotation mark that is not closed makes one cell of many.",
+        ) from error  # fmt: skip
     if len(rows) != len(numbered):
         raise invalid("path", expected="one row on each line", got="a quoted cell of several lines")
     lines = [i for i, _ in numbered]
@@ -128,6 +128,35 @@ def read_table(
             advice="Give names=[...] for all columns, and header=True to skip those of the file.",
         )  # fmt: skip
     return TextTable(columns, tuple(lines), decimal)
+
+
+def _lines(path: Path, encoding: str) -> Iterator[tuple[int, str]]:
+    """Lines that hold data, with their numbers; blank ones are not kept while reading on."""
+    try:
+        with _OPENERS.get(path.suffix, open)(path, "rt", encoding=encoding) as file:
+            for number in itertools.count(1):
+                text = file.readline(LONGEST_LINE)
+                if not text:
+                    return
+                if len(text) == LONGEST_LINE:
+                    expected = f"lines of fewer than {LONGEST_LINE} characters"
+                    raise invalid(
+                        "path", expected=expected, got=f"a longer line {number} in {path}"
+                    )
+                if text.strip() and text.lstrip()[0] not in "#%":
+                    yield number, text.strip("\r\n ")
+    except (UnicodeDecodeError, LookupError) as error:
+        raise invalid(
+            "encoding", expected=f"a text file in {encoding}", got=str(error),
+            advice='Give the encoding, for instance encoding="latin-1".',
+        ) from error  # fmt: skip
+    except (EOFError, zlib.error, lzma.LZMAError, OSError) as error:
+        if getattr(error, "filename", None) is not None:  # no damage, but no file
+            raise
+        raise invalid(
+            "path", expected="a whole compressed file", got=f"{path} ({error})",
+            advice="It is damaged, or not what its name says: copy it again.",
+        ) from error  # fmt: skip
 
 
 def _sniff(texts: list[str]) -> str:

@@ -14,9 +14,11 @@ from torch import Tensor
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.scaling import Scaling
+from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.inference.posteriors import MethodName, Mixture, Posterior
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.prepared import with_outputs
 from pyro_dynogp.models.system import System
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
@@ -104,6 +106,7 @@ class Fitted:
         """All parameters, batch (S,) of draws, in units of the scaled record."""
         return self.system_at(self.draws)
 
+    @isolated
     def system_at(self, values: Mapping[str, Tensor]) -> System:
         """All parameters at values of the sites."""
         with torch.no_grad():
@@ -148,8 +151,14 @@ class Fitted:
         """The fit with other draws (S, *shape), for what is computed from draws alone."""
         return replace(self, posterior=self.posterior.with_values(values), draws=values)
 
+    @isolated
     def log_joint(self, records: Record | Sequence[Record]) -> float:
-        """Log p(y, mode): of the records with the sites at the mode."""
+        """Log p(y, mode): of the records with the sites at the mode [nats].
+
+        Raises:
+            ValueError: where a record does not fit the model, or has no outputs.
+        """
+        measured = with_outputs(self.model.prepare(records))
         conditioned = pyro.poutine.condition(self.model.collapsed, data=dict(self.mode))
         with torch.no_grad():
-            return float(pyro.poutine.trace(conditioned).get_trace(records).log_prob_sum())
+            return float(pyro.poutine.trace(conditioned).get_trace(measured).log_prob_sum())

@@ -4,21 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from pyro_dynogp.support.checkpoints import NOTHING_KEPT, Checkpoints
-from pyro_dynogp.support.errors import invalid
-
-
-def at_least_one(**counts: int | None) -> None:
-    """Refuse numbers below one by their names; None is none given.
-
-    Raises:
-        ValueError: where one of them is not a positive whole number.
-    """
-    for name, count in counts.items():
-        if count is not None and (not isinstance(count, int | np.integer) or count < 1):
-            raise invalid(name, expected="a whole number >= 1", got=repr(count))
+from pyro_dynogp.support.errors import verify
 
 
 @dataclass(frozen=True)
@@ -32,7 +19,7 @@ class Run:
         steps: most iterations, None for the same.
 
     Raises:
-        ValueError: where restarts or steps is not a positive number.
+        ValueError: where a number is not what it has to be.
     """
 
     seed: int = 0
@@ -43,4 +30,4 @@ class Run:
     steps: int | None = None
 
     def __post_init__(self) -> None:
-        at_least_one(restarts=self.restarts, steps=self.steps, workers=self.workers)
+        verify(seed=self.seed, workers=self.workers, restarts=self.restarts, steps=self.steps)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -11,8 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors import SafetensorError
 from torch import Tensor
 from torch.distributions import biject_to
 
@@ -26,12 +26,15 @@ from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.layers.sites import Values
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.wiring import Dynamic, Known, Layer, Static
+from pyro_dynogp.support.checkpoints import DIGEST, read_tensors, write_tensors
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 
 FORMAT = "pyro_dynogp.fit"
-# Version 5 writes, 4 and 5 are read.
-VERSION, OLDEST = 5, 4
+# Version 6 is written; 4 and 5 are read, too.
+VERSION, OLDEST = 6, 4
+# The last version of files without a digest.
+UNMARKED = 5
 # The models that a file may name: a file never decides what code is run.
 MODELS = ("Model", "Cascade", "LinearDynamicGP")
 LAYERS: dict[str, type[Dynamic] | type[Static]] = {"Dynamic": Dynamic, "Static": Static}
@@ -44,8 +47,8 @@ def save(fit: Fitted, path: str | Path) -> None:
         ValueError: where the folder does not exist, or a layer has a kernel of the user's.
     """
     options = _options(fit.model)
-    tensors = {f"draws/{name}": value.contiguous() for name, value in fit.draws.items()}
-    tensors |= {f"mode/{name}": value.contiguous() for name, value in fit.mode.items()}
+    tensors = {f"draws/{name}": value for name, value in fit.draws.items()}
+    tensors |= {f"mode/{name}": value for name, value in fit.mode.items()}
     tensors["history"] = torch.as_tensor(np.ascontiguousarray(fit.history))
     tensors["start_energies"] = torch.as_tensor(np.ascontiguousarray(fit.start_energies))
     posterior, points = fit.posterior, list[str]()
@@ -72,17 +75,24 @@ def save(fit: Fitted, path: str | Path) -> None:
         "sites": list(fit.draws),
         "points": points,
     }
-    folder = Path(path).resolve().parent
-    if not folder.is_dir():
+    path = Path(path)
+    try:
+        write_tensors(path, tensors, {FORMAT: json.dumps(header)})
+    except (OSError, SafetensorError) as error:
+        why = getattr(error, "strerror", None) or error
         raise invalid(
-            "path", expected="a file in an existing folder", got=str(path), advice="Make it first."
-        )
-    clones = {name: value.clone() for name, value in tensors.items()}
-    save_file(clones, str(path), metadata={FORMAT: json.dumps(header)})
+            "path",
+            expected="a file in an existing folder that can be written to",
+            got=f"{path} ({why})",
+            advice="The fit is as it was, and so is a file that was there.",
+        ) from error
 
 
 def load(path: str | Path) -> Fitted:
     """Read a fit that `Fit.save` wrote.
+
+    Files of format 5 and before have no digest of their content: their sites, shapes and numbers
+    are checked, but a changed number cannot be seen, and a warning says so.
 
     Raises:
         ValueError: where the file is missing, damaged, not a pyro_dynogp fit, or of a version
@@ -91,16 +101,8 @@ def load(path: str | Path) -> Fitted:
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"load: there is no file {path}.")
-    try:
-        with safe_open(str(path), framework="pt") as file:
-            metadata = file.metadata() or {}
-            # Copies: vectorised sums round by where a tensor lies in memory, and in the file it
-            # may lie anywhere.
-            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise ValueError(
-            f"load: {path} is not a safetensors file, or it is damaged ({error})."
-        ) from error
+    again = "Take a copy of it, or fit again."
+    tensors, metadata = read_tensors(path, "load", again, marked=False)
     if FORMAT not in metadata:
         raise ValueError(
             f"load: {path} is a safetensors file, but not a fit of pyro_dynogp. "
@@ -109,7 +111,7 @@ def load(path: str | Path) -> Fitted:
     try:
         header = json.loads(metadata[FORMAT])
         version = header["version"]
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"load: the header of {path} is damaged ({error}).") from error
     if not isinstance(version, int) or not OLDEST <= version <= VERSION:
         raise ValueError(
@@ -117,10 +119,49 @@ def load(path: str | Path) -> Fitted:
             f"to {VERSION}. "
             "Use the version of pyro_dynogp that wrote it, or fit again."
         )
+    if DIGEST not in metadata:
+        if version > UNMARKED:
+            raise ValueError(f"load: {path} is damaged (it has no digest). {again}")
+        warnings.warn(
+            f"load: {path} was written before files had a digest: changed numbers cannot be seen. "
+            "Save the fit again to mend that.",
+            stacklevel=5,
+        )
     try:
-        return _restore(header, tensors)
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"load: {path} is incomplete or damaged ({error}).") from error
+        _refuse_large(header, path.stat().st_size)
+        found = _restore(header, tensors)
+        _check_numbers(found)
+    except Exception as error:  # whatever a file that nobody wrote may lead to
+        raise ValueError(f"load: {path} is incomplete or damaged ({error}). {again}") from error
+    return found
+
+
+def _refuse_large(part: object, size: int) -> None:
+    """Refuse a header with counts above the number of bytes of its file, before any is used."""
+    if isinstance(part, Mapping):
+        for name, value in part.items():
+            if name not in ("seed", "scaling", "diagnostics", "records"):
+                _refuse_large(value, size)
+    elif isinstance(part, list):
+        for value in part:
+            _refuse_large(value, size)
+    elif isinstance(part, int) and part > size:
+        raise invalid("options", expected=f"counts of at most {size}", got=str(part))
+
+
+def _check_numbers(fit: Fitted) -> None:
+    """Refuse sites that are not the model's, of other shapes, or that are not numbers."""
+    sites = {site.name: site.shape for site in fit.model.collapsed.all_sites(
+        fit.scaling, len(fit.records))}  # fmt: skip
+    count = len(next(iter(fit.draws.values())))
+    for kind, values, lead in (("draws", fit.draws, (count,)), ("mode", fit.mode, ())):
+        shapes = {name: value.shape for name, value in values.items()}
+        expected = {name: (*lead, *shape) for name, shape in sites.items()}
+        if shapes != expected:
+            raise invalid(kind, expected=f"{expected}", got=f"{shapes}")
+        for name, value in values.items():
+            if value.dtype != torch.float64 or not bool(value.isfinite().all()):
+                raise invalid(f"{kind}/{name}", expected="finite float64 numbers", got="others")
 
 
 def _options(model: Model) -> dict[str, Any]:

@@ -21,9 +21,12 @@ def train_model(
     """
     kept = Checkpoints.at(
         checkpoint,
-        *problem.identity,
-        type(method).__name__,
-        method.identity,
-        (run.seed, run.restarts, run.steps),
+        model=problem.model,
+        record=[each.record.fingerprint for each in problem.records],
+        start=problem.learnt,
+        method=method,
+        seed=run.seed,
+        restarts=run.restarts,
+        steps=run.steps,
     )
     return method(problem, replace(run, checkpoints=kept))

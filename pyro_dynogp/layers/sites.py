@@ -48,8 +48,8 @@ class Site:
 
         Of other distributions a draw.
         """
-        whole = torch.distributions.Independent
-        base = self.prior.base_dist if isinstance(self.prior, whole) else self.prior
+        prior = self.prior
+        base = prior.base_dist if isinstance(prior, torch.distributions.Independent) else prior
         if isinstance(base, torch.distributions.LogNormal):
             return base.loc.exp().expand(self.shape).clone()
         if isinstance(base, torch.distributions.Normal):

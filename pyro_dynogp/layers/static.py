@@ -24,7 +24,7 @@ from torch import Tensor
 from pyro_dynogp.layers.functions import JITTER, StaticFunction, even_grid
 from pyro_dynogp.layers.kernels import KernelPrior
 from pyro_dynogp.layers.sites import Site, Values, normal, sample
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import invalid, verify
 from pyro_dynogp.support.tensors import as_tensor
 
 MeanName = Literal["constant", "linear"]
@@ -89,7 +89,7 @@ class StaticPrior:
     locations: Any = None
 
     def __post_init__(self) -> None:
-        _check_counts(channels=self.channels, outputs=self.outputs, inducing=self.inducing)
+        verify(channels=self.channels, outputs=self.outputs, inducing=self.inducing)
         if self.mean not in ("constant", "linear"):
             raise invalid("mean", expected="'constant' or 'linear'", got=repr(self.mean))
 
@@ -232,7 +232,7 @@ def static_gp(
         ValueError: if an option or shape is wrong, or x is not finite.
     """
     d, e = 1 if channels is None else channels, 1 if outputs is None else outputs
-    _check_counts(channels=d, outputs=e)
+    verify(channels=d, outputs=e)
     points = as_tensor(x)
     if channels is None:
         points = points.unsqueeze(-1)
@@ -269,12 +269,6 @@ def static_gp(
     return pyro.sample(name, dist.Normal(loc, scale).to_event(event))
 
 
-def _check_counts(**counts: Any) -> None:
-    for argument, count in counts.items():
-        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-            raise invalid(argument, expected="a whole number of at least one", got=repr(count))
-
-
 def _points(argument: str, value: Any, channels: int) -> Tensor:
     """Points (K, d) as a user may write them."""
     points = as_tensor(value)
@@ -292,7 +286,7 @@ def _support(support: Any, x: Tensor) -> Tensor:
     """Support points (*b, K, d) for points x (*b, n, d)."""
     if not isinstance(support, int):
         return _points("support", support, x.shape[-1])
-    _check_counts(support=support)
+    verify(support=support)
     x = x.detach()
     if x.shape[-1] > 1:
         index = torch.linspace(0, x.shape[-2] - 1, min(support, x.shape[-2]), dtype=torch.float64)

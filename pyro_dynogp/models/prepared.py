@@ -10,6 +10,7 @@ from torch import Tensor
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.lti.grid import TimeGrid, time_grid
+from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.tensors import as_tensor
 
 
@@ -70,6 +71,19 @@ def _scaled(inputs: Tensor, scaling: Scaling) -> Tensor:
     if not inputs.shape[-1]:
         return inputs
     return (inputs - as_tensor(scaling.input_offset)) / as_tensor(scaling.input_scale)
+
+
+def with_outputs(
+    records: Sequence[PreparedRecord], argument: str = "record"
+) -> Sequence[PreparedRecord]:
+    """Records that all have outputs.
+
+    Raises:
+        ValueError: where one has none: nothing was measured there that could be compared.
+    """
+    if not all(record.has_outputs for record in records):
+        raise invalid(argument, expected="measured outputs", got="a record without outputs")
+    return records
 
 
 def as_measured(records: Records) -> tuple[Record, ...]:

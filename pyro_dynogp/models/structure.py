@@ -15,7 +15,7 @@ from pyro_dynogp.layers.noise import Gaussian, Likelihood
 from pyro_dynogp.models.prepared import PreparedRecord, Records
 from pyro_dynogp.models.priors import PriorName
 from pyro_dynogp.models.wiring import INPUTS, Dynamic, Known, Layer, StaticLayer, Wire, wire
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import invalid, one_of, verify, whole
 
 Integrate = Literal["none", "last", "all"]
 InitialState = Literal["auto", "site", "integrated", "zero"]
@@ -53,8 +53,7 @@ class Structure:
     output: str | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.inputs, int) or self.inputs < 0:
-            raise invalid("inputs", expected="a whole number >= 0", got=repr(self.inputs))
+        verify(inputs=self.inputs)
         object.__setattr__(self, "layers", tuple(self.layers))
         object.__setattr__(self, "channels", tuple(self.channels))
         if not isinstance(self.likelihood, Likelihood):
@@ -63,19 +62,10 @@ class Structure:
                 expected="Gaussian(), StudentT(...) or Heteroscedastic(...)",
                 got=repr(self.likelihood),
             )
-        for name, choices in (
-            ("priors", get_args(PriorName)),
-            ("integrate", get_args(Integrate)),
-            ("initial_state", get_args(InitialState)),
-        ):
-            if getattr(self, name) not in choices:
-                *most, last = (repr(choice) for choice in choices)
-                expected = f"{', '.join(most)} or {last}"
-                raise invalid(name, expected=expected, got=repr(getattr(self, name)))
-        least = count_direct(self.channels)
-        if not isinstance(self.direct, int) or not least <= self.direct <= self.inputs:
-            expected = f"a whole number from {least} to {self.inputs}"
-            raise invalid("direct", expected=expected, got=repr(self.direct))
+        one_of(get_args(PriorName)).check("priors", self.priors)
+        one_of(get_args(Integrate)).check("integrate", self.integrate)
+        one_of(get_args(InitialState)).check("initial_state", self.initial_state)
+        whole(count_direct(self.channels), self.inputs).check("direct", self.direct)
         end = self.output_wire.layer  # placing the layers refuses those that do not fit together
         if self.has_feedback:
             _check_feedback(self.integrate, self.likelihood)

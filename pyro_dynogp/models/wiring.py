@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import ClassVar, Literal
 
 import pyro.distributions as dist
@@ -11,7 +11,7 @@ from gpytorch.kernels import Kernel
 from torch import Tensor
 
 from pyro_dynogp.lti.modes import NoiseStructure
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import RULES, invalid
 
 INPUTS = "inputs"
 # Lowest and highest value, None where there is none.
@@ -300,9 +300,7 @@ def _check_that_all_matter(wires: Sequence[Wire], output: str) -> None:
 
 
 def _check_layer(name: str, layer: Layer) -> None:
-    numbers = {"outputs": layer.outputs}
     if isinstance(layer, Dynamic):
-        numbers["pairs"] = layer.pairs
         if layer.noise not in ("shared", "independent"):
             raise invalid(
                 f"noise of layer {name!r}",
@@ -317,19 +315,16 @@ def _check_layer(name: str, layer: Layer) -> None:
             got = repr(layer.function)
             raise invalid(f"function of layer {name!r}", expected="a function of torch", got=got)
     else:
-        numbers["inducing"] = layer.inducing
-        numbers["support"] = layer.support
         if layer.mean not in (None, "constant", "linear"):
             raise invalid(
                 f"mean of layer {name!r}",
                 expected="'constant' or 'linear'",
                 got=repr(layer.mean),
             )
-    for argument, value in numbers.items():
-        if not isinstance(value, int) or value < 1:
-            raise invalid(
-                f"{argument} of layer {name!r}", expected="a whole number >= 1", got=repr(value)
-            )
+    for option in fields(layer):
+        value = getattr(layer, option.name)
+        if option.name in RULES and not (value is None and option.default is None):
+            RULES[option.name].check(f"{option.name} of layer {name!r}", value)
 
 
 def _check_limits(name: str, layer: Static, channels: int, last: bool) -> None:

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pyro_dynogp.plotting import style
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import invalid, whole
 
 if TYPE_CHECKING:
     from pyro_dynogp.data.record import Record
@@ -150,21 +150,8 @@ def _leave_out(axes: Axes, x: np.ndarray, drawn: np.ndarray, skip: int) -> None:
 def _check(prediction: Prediction, record: Record | None, skip: int, past: Record | None) -> None:
     names = prediction.output_names
     if record is not None:
-        if not np.array_equal(record.time, prediction.time):
-            raise invalid(
-                "record",
-                expected=f"the {len(prediction)} times of the prediction",
-                got=f"{len(record)} times"
-                if len(record) != len(prediction)
-                else "other times of the same number",
-                advice="Give the record that the prediction was made for.",
-            )
-        if record.n_outputs and record.output_names != names:
-            raise invalid(
-                "record", expected=f"outputs {list(names)}", got=f"{list(record.output_names)}"
-            )
-    if not 0 <= skip < len(prediction):
-        raise invalid("skip", expected=f"a number from 0 to {len(prediction) - 1}", got=repr(skip))
+        prediction.check(record, outputs=record.n_outputs > 0)
+    whole(0, len(prediction) - 1).check("skip", skip)
     if past is None:
         return
     if past.output_names != names:

@@ -13,11 +13,10 @@ from pyro_dynogp.models.draws import variance_multiples
 from pyro_dynogp.models.exact_outputs import ExactOutputs, spread_evenly
 from pyro_dynogp.models.output_process import OutputProcess, flat
 from pyro_dynogp.models.outputs import output_process
-from pyro_dynogp.models.prepared import PreparedRecord
+from pyro_dynogp.models.prepared import PreparedRecord, with_outputs
 from pyro_dynogp.prediction.first_state import beginning, unknown_beginning
 from pyro_dynogp.prediction.prediction import Parts, Prediction
 from pyro_dynogp.prediction.records import following, prepared
-from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.parallel import seeded
 
 if TYPE_CHECKING:
@@ -51,8 +50,7 @@ def forecast(
 ) -> Prediction:
     """See `Fit.forecast`."""
     earlier, later, gap = following(fit, past, future)
-    if not earlier.has_outputs:
-        raise invalid("past", expected="outputs to start from", got="none")
+    with_outputs([earlier], "past")
     with torch.no_grad():
         before = output_process(beginning(fit, earlier, predicting=True), earlier)
         start = before.state_after(
@@ -77,7 +75,7 @@ def _forward(
     names = fit.scaling.output_names
     return Prediction(
         record.record.time, names, found.mean, found.variance, found.noise_variance,
-        Parts(found.parts), found.draw, kind,
+        Parts(found.parts), found.draw, kind, output_units=fit.scaling.output_units,
     )  # fmt: skip
 
 
@@ -93,7 +91,7 @@ def warn_of_divergence(fit: Fitted, record: Record, runs: np.ndarray, kind: str)
             f"{kind}: {left.any(1).sum()} of {len(runs)} free runs leave the range of the training "
             f"outputs by more than {FAR:g} times its width, first at sample {first} (time "
             f"{record.time[first]:.6g}). What follows is no prediction.",
-            stacklevel=5,
+            stacklevel=7,
         )
 
 
@@ -102,14 +100,11 @@ def predict(
 ) -> Prediction:
     """See `Fit.predict`."""
     along = prepared(fit, record)
-    if not isinstance(horizon, int | np.integer) or horizon < 1:
-        raise invalid("horizon", expected="a whole number >= 1", got=repr(horizon))
-    if not along.has_outputs:
-        raise invalid("record", expected="outputs to predict from", got="none")
+    with_outputs([along])
     y = along.observations
     with torch.no_grad():
         outputs = output_process(beginning(fit, along, predicting=True), along)
-        found = outputs.ahead(y, int(horizon))
+        found = outputs.ahead(y, horizon)
         mean, variance = flat(found.mean), flat(found.variance)
         noise = flat((outputs.scale * outputs.noise_sd).square())
     noise = np.broadcast_to(noise, mean.shape)
@@ -127,7 +122,7 @@ def predict(
     def draw() -> np.ndarray:
         if joint:
             with torch.no_grad(), seeded(seed):
-                errors = outputs.prediction_errors(y, int(horizon), -(-samples // len(mean)))
+                errors = outputs.prediction_errors(y, horizon, -(-samples // len(mean)))
             if errors is not None:
                 return spread_evenly(mean + errors.numpy(), samples)
         generator = np.random.default_rng(seed)
@@ -137,13 +132,15 @@ def predict(
         return mean[which] + sd * generator.standard_normal(sd.shape)
 
     kind = f"{horizon}-step prediction" + (JOINT if exact and horizon > 1 else "")
-    names = fit.scaling.output_names
+    names, units = fit.scaling.output_names, fit.scaling.output_units
     if likelihood.gaussian:
-        return Prediction(record.time, names, mean, variance, noise, parts, draw, kind)
+        return Prediction(
+            record.time, names, mean, variance, noise, parts, draw, kind, output_units=units
+        )
     # Each draw of the parameters gives a component for each of the mixture that the noise is.
     S, K = len(mean), len(shares)
     return Prediction(
         record.time, names, np.repeat(mean, K, 0), np.repeat(variance, K, 0),
         (noise[:, None] * multiples[:, None, None]).reshape(S * K, *noise.shape[1:]),
-        parts, draw, kind, weights=np.tile(shares, S) / S,
+        parts, draw, kind, weights=np.tile(shares, S) / S, output_units=units,
     )  # fmt: skip

@@ -10,8 +10,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
 from scipy.special import log_ndtr, logsumexp, ndtr, ndtri, ndtri_exp
 
+from pyro_dynogp.data.checks import as_channels, real_numbers
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.records import one_record
+from pyro_dynogp.inference.isolation import alone
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 
@@ -49,7 +54,8 @@ class Parts(Mapping[str, np.ndarray]):
 
     @cached_property
     def _found(self) -> Mapping[str, np.ndarray]:
-        return self._compute()
+        with alone():
+            return self._compute()
 
     def __getitem__(self, cause: str) -> np.ndarray:
         return self._found[cause]
@@ -80,6 +86,7 @@ class Prediction:
         sampler: draws joint samples (S', n, n_y); called once.
         kind: what was predicted, in words.
         weights: (S,) of the components; None for equal ones.
+        output_units: of the n_y outputs; None where they are not known.
     """
 
     time: np.ndarray
@@ -91,6 +98,7 @@ class Prediction:
     sampler: Callable[[], np.ndarray]
     kind: str
     weights: np.ndarray | None = None
+    output_units: tuple[str, ...] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """With joint samples drawn and shares computed: any callable may have been behind them."""
@@ -143,7 +151,34 @@ class Prediction:
     @cached_property
     def samples(self) -> np.ndarray:
         """Joint samples (S', n, n_y) of measured outputs."""
-        return self.sampler()
+        with alone():
+            return self.sampler()
+
+    def check(self, record: Record, *, outputs: bool = True) -> None:
+        """Refuse a record that this is no prediction of.
+
+        Args:
+            record: it was made for. outputs: whether its outputs are to be compared.
+
+        Raises:
+            ValueError: no record, other times, other outputs, or outputs in other units.
+        """
+        advice = "Compare a prediction with the record that it was made for."
+        if not np.array_equal(self.time, one_record(record, advice).time):
+            same = len(self) == len(record)
+            raise invalid(
+                "prediction",
+                expected=f"the {len(record)} times of the record",
+                got="other times of the same number" if same else f"{len(self)} times",
+                advice=advice,
+            )
+        for name in ("output_names", "output_units") if outputs else ():
+            expected, got = getattr(self, name), getattr(record, name)
+            if expected is not None and tuple(expected) != got:
+                expected = f"{list(expected)}, as predicted"
+                raise invalid(
+                    f"record.{name}", expected=expected, got=f"{list(got)}", advice=advice
+                )
 
     def quantile(self, q: Any) -> np.ndarray:
         """Quantiles of measured outputs.
@@ -154,7 +189,7 @@ class Prediction:
         Returns:
             (n, n_y) for one probability, (len(q), n, n_y) for several.
         """
-        levels = np.atleast_1d(np.asarray(q, dtype=float))
+        levels = np.atleast_1d(real_numbers("q", q))
         if not ((levels > 0) & (levels < 1)).all():
             raise invalid("q", expected="probabilities between 0 and 1", got=repr(q))
         out = np.stack([self._quantile(float(level)) for level in levels])
@@ -184,17 +219,22 @@ class Prediction:
             found, last = found + step, np.abs(step)
         return found
 
-    def log_density(self, outputs: np.ndarray) -> np.ndarray:
+    def log_density(self, outputs: ArrayLike) -> np.ndarray:
         """Log-density (n, n_y) of each measured output by itself; NaN where it is missing."""
-        z = (outputs - self.component_mean) / self.component_sd
+        z = self._standardised(outputs)
         terms = -0.5 * z**2 - np.log(self.component_sd) - 0.5 * np.log(2.0 * np.pi)
         return logsumexp(terms + np.log(self.component_weights)[:, None, None], axis=0)
 
-    def probability_integral(self, outputs: np.ndarray) -> np.ndarray:
+    def probability_integral(self, outputs: ArrayLike) -> np.ndarray:
         """Predictive distribution function (n, n_y) at the measured outputs."""
-        return self._average(ndtr((outputs - self.component_mean) / self.component_sd))
+        return self._average(ndtr(self._standardised(outputs)))
 
-    def normal_scores(self, outputs: np.ndarray) -> np.ndarray:
+    def _standardised(self, outputs: ArrayLike) -> np.ndarray:
+        """Outputs (n, n_y), or (n,) of one, in deviations from each component (S, n, n_y)."""
+        y = as_channels("outputs", outputs, len(self), len(self.output_names))
+        return (y - self.component_mean) / self.component_sd
+
+    def normal_scores(self, outputs: ArrayLike) -> np.ndarray:
         """Errors (n, n_y) of measured outputs, as quantiles of the standard normal distribution.
 
         Standard normal if the prediction is right, of whatever shape it is: the normal quantile of
@@ -203,7 +243,7 @@ class Prediction:
         Source: randomised quantile residuals of a continuous distribution, Dunn & Smyth, J. Comput.
         Graph. Stat. 5(3):236 (1996).
         """
-        z = (outputs - self.component_mean) / self.component_sd
+        z = self._standardised(outputs)
         if len(z) == 1:
             return z[0]
         share = np.log(self.component_weights)[:, None, None]

@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.prediction.mixture_score import mixture_scores
 from pyro_dynogp.prediction.prediction import Prediction
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import invalid, whole
 
 
+@isolated
 def scores(prediction: Prediction, record: Record, skip: int = 0) -> dict[str, Any]:
     """Compare a prediction with the outputs of a record.
 
@@ -33,25 +35,10 @@ def scores(prediction: Prediction, record: Record, skip: int = 0) -> dict[str, A
         - ``count``: number of samples scored.
 
     Raises:
-        ValueError: where times differ, no output is left, or skip is out of range.
+        ValueError: where times, outputs or units differ, none is left, or skip is out of range.
     """
-    if len(prediction) != len(record) or not np.array_equal(prediction.time, record.time):
-        raise invalid(
-            "prediction",
-            expected=f"the {len(record)} times of the record",
-            got=f"{len(prediction)} times"
-            if len(prediction) != len(record)
-            else "other times of the same number",
-            advice="Score a prediction with the record that it was made for.",
-        )
-    if record.n_outputs != prediction.mean.shape[1]:
-        raise invalid(
-            "record",
-            expected=f"{prediction.mean.shape[1]} measured outputs",
-            got=str(record.n_outputs),
-        )
-    if not 0 <= skip < len(record):
-        raise invalid("skip", expected=f"a number from 0 to {len(record) - 1}", got=repr(skip))
+    prediction.check(record)
+    skip = whole(0, len(record) - 1).check("skip", skip)
     y = record.outputs
     columns: dict[str, list[float]] = {}
     for a in range(y.shape[1]):

@@ -14,6 +14,7 @@ from pyro_dynogp.discrepancy.state import SearchState
 from pyro_dynogp.discrepancy.trials import without
 from pyro_dynogp.effects import CATALOGUE, Effect
 from pyro_dynogp.fitting import fit as fit_model
+from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.inference.refit import WARMUP, family_of
 from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
 from pyro_dynogp.models.model import Model
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 LAST_LINEAR_STARTS, LAST_CASCADE_STARTS = 2, 1
 
 
+@isolated
 @one_thread()
 def close_loop(
     fit: Fit,
@@ -78,10 +80,6 @@ def close_loop(
     Raises:
         ValueError: on blocks that are too short, unknown candidates, numbers that make no sense.
     """
-    if not isinstance(max_rounds, int) or max_rounds < 1:
-        raise invalid("max_rounds", expected="a whole number >= 1", got=repr(max_rounds))
-    if not 0.0 < level < 1.0:
-        raise invalid("level", expected="a number between 0 and 1", got=repr(level))
     settings = LoopSettings() if settings is None else settings
     watch = Stopwatch()
     other = candidates if isinstance(candidates, Record) else None

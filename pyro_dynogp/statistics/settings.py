@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import COUNT, POSITIVE, invalid
 
 
 @dataclass(frozen=True)
@@ -130,9 +130,8 @@ class LoopSettings:
 
     def __post_init__(self) -> None:
         for entry in fields(self):
-            value = getattr(self, entry.name)
-            if not value > 0:
-                raise invalid(entry.name, expected="a number > 0", got=repr(value))
+            rule = COUNT if isinstance(entry.default, int) else POSITIVE
+            rule.check(entry.name, getattr(self, entry.name))
         if self.fit_share + self.search_share >= 1.0:
             got = f"{self.fit_share + self.search_share:g}"
             raise invalid("fit_share and search_share", expected="a sum below 1", got=got)

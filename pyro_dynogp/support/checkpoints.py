@@ -7,12 +7,17 @@ computed when the same run is started again. Files are safetensors; nothing is p
 
 from __future__ import annotations
 
-import hashlib
+import contextlib
+import errno
 import json
 import os
-from collections.abc import Callable, Mapping
+import re
+import secrets
+import socket
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -20,8 +25,13 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.identity import digest, versions
 
 Piece = dict[str, Tensor]
+# Of a file's texts, the one that is the digest of all else in it.
+DIGEST = "pyro_dynogp.sha256"
+# This machine, in the names of files that are being written.
+HOST = re.sub(r"\W", "_", socket.gethostname())
 
 
 @dataclass(frozen=True)
@@ -37,31 +47,38 @@ class Checkpoints:
     fingerprint: str
 
     @classmethod
-    def at(cls, folder: str | Path | None, *identity: object) -> Checkpoints:
-        """For a run that the given values (their `repr`) identify.
+    def at(cls, folder: str | Path | None, **identity: object) -> Checkpoints:
+        """For a run that the given values, by their content, and versions of packages identify.
 
         Raises:
-            ValueError: where the folder holds the pieces of another run.
+            ValueError: where the folder holds the pieces of another run; what differs is named.
+            OSError: where nothing can be written there.
         """
-        text = "\n".join(repr(part) for part in identity)
-        fingerprint = hashlib.sha256(text.encode()).hexdigest()
         if folder is None:
-            return cls(None, fingerprint)
+            return cls(None, "")
+        known = {**identity, "versions": versions()}
+        parts = {name: digest(value) for name, value in known.items()}
+        fingerprint = digest(parts)
         path = Path(folder)
-        path.mkdir(parents=True, exist_ok=True)
-        note = path / "run.json"
-        if note.exists():
-            found = json.loads(note.read_text()).get("fingerprint")
-            if found != fingerprint:
-                raise invalid(
-                    "checkpoint",
-                    expected="a new folder, or that of a run with the same model, record, seed "
-                    "and settings",
-                    got=f"{path}, which holds another run",
-                    advice="Give another folder, or remove this one.",
-                )
-        else:
-            _write(note, lambda p: p.write_text(json.dumps({"fingerprint": fingerprint})))
+        note, text = path / "run.json", json.dumps({"fingerprint": fingerprint, "parts": parts})
+        with _told(path):
+            path.mkdir(parents=True, exist_ok=True)
+            for stale in path.glob(f"*.{HOST}-*.part"):  # of processes that were killed
+                if not _lives(int(stale.name.split("-")[-2])):
+                    stale.unlink(missing_ok=True)
+            if not note.exists():  # of two that begin here at once one makes it, both read it
+                _write(note, lambda p: p.write_text(text), replace=False)
+        found = _read_note(note)
+        if found["fingerprint"] != fingerprint:
+            theirs = found.get("parts", {})
+            differs = [name for name, part in parts.items() if theirs.get(name) != part]
+            raise invalid(
+                "checkpoint",
+                expected="a new folder, or that of a run with the same model, record, seed, "
+                "settings and versions of packages",
+                got=f"{path}, which holds another run (another {', '.join(differs)})",
+                advice="Give another folder, or remove this one.",
+            )
         return cls(path, fingerprint)
 
     def piece(self, key: str, compute: Callable[[], Mapping[str, Tensor]]) -> Piece:
@@ -70,32 +87,123 @@ class Checkpoints:
             return dict(compute())
         path = self.folder / f"{key}.safetensors"
         if path.exists():
-            try:
-                with safe_open(str(path), framework="pt") as file:
-                    # Copies: vectorised sums round by where a tensor lies in memory, and in the
-                    # file it may lie anywhere.
-                    return {n: file.get_tensor(n).clone() for n in file.keys()}  # noqa: SIM118
-            except (SafetensorError, OSError) as error:
-                raise ValueError(
-                    f"checkpoint: {path} is damaged ({error}). Remove it: what it holds is "
-                    "computed again."
-                ) from error
-        result = {name: value.detach().clone().contiguous() for name, value in compute().items()}
-        _write(path, lambda p: save_file(result, str(p)))
-        return result
+            return read_tensors(path, "checkpoint", "Remove it: what it holds is computed again.")[
+                0
+            ]
+        result = dict(compute())
+        with _told(self.folder):
+            return write_tensors(path, result, {})
 
 
 # For runs that keep nothing.
 NOTHING_KEPT = Checkpoints(None, "")
 
 
-def _write(path: Path, writer: Callable[[Path], object]) -> None:
-    """Write a file that is there whole or not at all."""
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    writer(part)
-    with open(part, "rb") as file:
-        os.fsync(file.fileno())
-    part.replace(path)
+@contextlib.contextmanager
+def _told(folder: Path) -> Iterator[None]:
+    """Say in a sentence that a folder cannot be written to."""
+    try:
+        yield
+    except (OSError, SafetensorError) as error:
+        why = getattr(error, "strerror", None) or error
+        number = getattr(error, "errno", None) or errno.EIO
+        raise OSError(
+            number,
+            f"checkpoint: {folder} cannot be written to ({why}). What was finished before is kept "
+            "there: the same call goes on from it once there is room and leave to write",
+        ) from error
+
+
+def _read_note(note: Path) -> dict[str, Any]:
+    try:
+        found = json.loads(note.read_text())
+        if not isinstance(found, dict) or "fingerprint" not in found:
+            raise ValueError("no fingerprint in it")
+    except (ValueError, OSError) as error:
+        raise invalid(
+            "checkpoint", expected=f"a note {note} of whose run the folder is",
+            got=f"one that cannot be read ({error})", advice="Remove the folder, or give another.",
+        ) from error  # fmt: skip
+    return found
+
+
+def _lives(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # somebody else's
+        return True
+    return True
+
+
+def _write(path: Path, writer: Callable[[Path], object], *, replace: bool = True) -> None:
+    """Write a file that is there whole or not at all, readable to whom the user's mask says.
+
+    Args:
+        path: of the file. writer: is called with the path of a file to write.
+        replace: whether to replace a file that is there, or to leave it as it is.
+    """
+    part = path.with_name(f"{path.name}.{HOST}-{os.getpid()}-{secrets.token_hex(4)}.part")
+    try:
+        with open(part, "xb"):  # made here, so that its mode is what the user's mask says
+            mode = part.stat().st_mode
+        writer(part)
+        part.chmod(mode)  # a writer may have made the file anew
+        with open(part, "rb") as file:
+            os.fsync(file.fileno())
+        if replace:
+            part.replace(path)
+        else:
+            with contextlib.suppress(FileExistsError):
+                os.link(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def write_tensors(path: Path, tensors: Piece, texts: Mapping[str, str]) -> Piece:
+    """Write a safetensors file with a digest of all that is in it, whole or not at all.
+
+    Returns:
+        The tensors as they are in it, which share no memory with what was given.
+    """
+    apart = {name: value.detach().clone().contiguous() for name, value in tensors.items()}
+    marked = {**texts, DIGEST: content_digest(apart, texts)}
+    _write(path, lambda part: save_file(apart, str(part), metadata=marked))
+    return apart
+
+
+def read_tensors(
+    path: Path, what: str, advice: str, *, marked: bool = True
+) -> tuple[Piece, dict[str, str]]:
+    """The tensors of a safetensors file, and its texts.
+
+    Args:
+        path: of the file. what: to begin an error with. advice: to end it with.
+        marked: whether it must have a digest; one that it has must be right in any case.
+
+    Raises:
+        ValueError: where it is no such file, or not as it was written.
+    """
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            texts = dict(file.metadata() or {})
+            # Copies: vectorised sums round by where a tensor lies in memory, and in the file it
+            # may lie anywhere.
+            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
+        mark = texts.pop(DIGEST, None)
+        if (mark is None and marked) or mark not in (None, content_digest(tensors, texts)):
+            raise ValueError("its content is not what was written")
+    except (SafetensorError, OSError, ValueError, TypeError, KeyError, RuntimeError) as error:
+        raise ValueError(
+            f"{what}: {path} is not a safetensors file, or it is damaged ({error}). {advice}"
+        ) from error
+    return tensors, texts if mark is None else {**texts, DIGEST: mark}
+
+
+def content_digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
+    """Hex SHA-256 of tensors, bit by bit, and texts by their names."""
+    return digest([sorted(metadata.items()), sorted(tensors.items())])
 
 
 def text_tensor(text: str) -> Tensor:

@@ -1,6 +1,19 @@
-"""One form for the errors that a user can cause: what is wrong, with which argument, what to do."""
+"""Bad input: one form of error, and one table of what arguments have to be, by their names."""
 
 from __future__ import annotations
+
+import functools
+import inspect
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from numbers import Integral, Real
+from typing import Any, ParamSpec, TypeVar
+
+import numpy as np
+
+Given = ParamSpec("Given")
+Result = TypeVar("Result")
 
 
 def invalid(argument: str, *, expected: str, got: str, advice: str = "") -> ValueError:
@@ -17,3 +30,110 @@ def invalid(argument: str, *, expected: str, got: str, advice: str = "") -> Valu
     """
     message = f"{argument}: expected {expected}, got {got}."
     return ValueError(f"{message} {advice}" if advice else message)
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What a value has to be.
+
+    Attributes:
+        expected: in words. plain: the value as plain Python, None where it is not what is expected.
+    """
+
+    expected: str
+    plain: Callable[[object], Any]
+
+    def check(self, argument: str, value: object) -> Any:
+        """The value as plain Python.
+
+        Raises:
+            ValueError: where it is not what is expected.
+        """
+        found = self.plain(value)
+        if found is None:
+            got = repr(value) if len(repr(value)) < 200 else f"a {type(value).__name__}"
+            raise invalid(argument, expected=self.expected, got=got)
+        return found
+
+
+def whole(least: int, most: float = math.inf) -> Rule:
+    """A whole number between bounds; True and False are none."""
+
+    def plain(value: object) -> int | None:
+        number = isinstance(value, Integral) and not isinstance(value, bool)
+        return int(value) if number and least <= value <= most else None  # type: ignore
+
+    to = f">= {least}" if most == math.inf else f"from {least} to {most}"
+    return Rule(f"a whole number {to}", plain)
+
+
+def between(low: float, high: float, expected: str) -> Rule:
+    """A real number within open bounds; not NaN, True or False."""
+
+    def plain(value: object) -> float | None:
+        number = isinstance(value, Real) and not isinstance(value, bool)
+        return float(value) if number and low < value < high else None  # type: ignore
+
+    return Rule(expected, plain)
+
+
+def one_of(choices: Iterable[str]) -> Rule:
+    """One of several names."""
+    *most, last = names = list(choices)
+    expected = f"{', '.join(map(repr, most))} or {last!r}"
+    return Rule(
+        expected, lambda value: value if isinstance(value, str) and value in names else None
+    )
+
+
+SWITCH = Rule(
+    "True or False", lambda value: bool(value) if isinstance(value, bool | np.bool_) else None
+)
+COUNT, NUMBER = whole(1), whole(0)
+POSITIVE = between(0.0, math.inf, "a finite number > 0")
+SHARE = between(0.0, 1.0, "a number between 0 and 1")
+# What an argument of each name has to be, wherever it is one; None is none given where that is the
+# default.
+RULES = {
+    **dict.fromkeys(("draws", "samples", "particles", "chains", "warmup", "restarts", "steps",
+                     "horizon", "points", "workers", "max_rounds", "tries", "channels", "outputs",
+                     "inducing", "support", "pairs", "brownian"), COUNT),
+    **dict.fromkeys(("prior_samples", "refits", "channel", "inputs", "fed"), NUMBER),
+    **dict.fromkeys(("progress", "process_noise", "feedthrough", "learn_locations"), SWITCH),
+    "seed": Rule("a whole number from 0 to 2**63 - 1", whole(0, 2**63 - 1).plain),
+    "level": SHARE,
+    "learning_rate": POSITIVE,
+    "folds": whole(2),
+    "replicates": whole(2),
+}  # fmt: skip
+
+
+def verify(**arguments: Any) -> None:
+    """Check arguments by the rules of their names; None is none given.
+
+    Raises:
+        ValueError: where one of them is not what its name asks for.
+    """
+    for name, value in arguments.items():
+        if value is not None:
+            RULES[name].check(name, value)
+
+
+def checked(function: Callable[Given, Result]) -> Callable[Given, Result]:
+    """Check the arguments of a function that `RULES` names, before any work; a decorator.
+
+    They come to the function as plain numbers. None passes where it is the default.
+    """
+    signature = inspect.signature(function)
+    ruled = [p for p in signature.parameters.values() if p.name in RULES]
+
+    @functools.wraps(function)
+    def call(*args: Given.args, **kwargs: Given.kwargs) -> Result:
+        bound = signature.bind(*args, **kwargs)
+        given = bound.arguments
+        for p in ruled:
+            if p.name in given and not (given[p.name] is None and p.default is None):
+                given[p.name] = RULES[p.name].check(p.name, given[p.name])
+        return function(*bound.args, **bound.kwargs)
+
+    return call

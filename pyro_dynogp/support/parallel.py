@@ -7,19 +7,29 @@ Work goes through joblib. By default it runs in local processes; inside
 from __future__ import annotations
 
 import contextlib
+import functools
+import os
 import random
+import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
 import joblib
 import numpy as np
 import torch
+from joblib.externals.loky import BrokenProcessPool
 from joblib.parallel import get_active_backend
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import verify
 
+# How often work is begun of which processes were killed.
+ATTEMPTS = 3
+# Threads of one process take turns: random numbers, Pyro's handlers and the number of threads are
+# the process's. Held only while a piece of work runs.
+_TURN = threading.RLock()
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -83,9 +93,9 @@ def parallel_map(
     Raises:
         ValueError: where workers is not a positive whole number. Errors of the function are
             raised here as they are.
+        RuntimeError: where processes are killed again and again.
     """
-    if workers is not None and workers < 1:
-        raise invalid("workers", expected="a whole number >= 1, or None", got=repr(workers))
+    verify(workers=workers)
     bar = tqdm(total=len(items), desc=description, disable=not progress)
     results: list[Result] = []
 
@@ -95,20 +105,46 @@ def parallel_map(
             bar.set_postfix_str(news(results), refresh=False)
         bar.update()
 
+    parent = os.getpid()
     with bar:
         if workers == 1 or len(items) <= 1:
             for item in items:
-                advance(_call(function, item))
+                advance(_call(function, item, parent))
             return results
         backend, _ = get_active_backend()
         local = type(backend).__name__ == "LokyBackend"
         count = min(len(items), workers or joblib.cpu_count()) if local else workers
-        pool = joblib.Parallel(n_jobs=count, return_as="generator" if local else "list")
-        for result in pool(joblib.delayed(_call)(function, item) for item in items):
-            advance(result)
+        kind = "generator" if local else "list"
+        for attempt in range(ATTEMPTS):
+            pool, lost = joblib.Parallel(n_jobs=count, return_as=kind), items[len(results) :]
+            try:
+                for result in pool(joblib.delayed(_call)(function, item, parent) for item in lost):
+                    advance(result)
+                break
+            except BrokenProcessPool as error:  # a process was killed: what it had begun is lost
+                if attempt == ATTEMPTS - 1:
+                    raise RuntimeError(
+                        f"Worker processes were killed {ATTEMPTS} times, with {len(results)} of "
+                        f"{len(items)} pieces of work done. Where memory is short, fewer workers "
+                        "need less of it."
+                    ) from error
     return results
 
 
-@one_thread()
-def _call(function: Callable[[Any], Any], item: Any) -> Any:
-    return function(item)
+def _call(function: Callable[[Any], Any], item: Any, parent: int) -> Any:
+    if os.getppid() == parent:
+        _end_with(parent)
+    with _TURN, one_thread():
+        return function(item)
+
+
+@functools.cache
+def _end_with(parent: int) -> None:
+    """End this process when its parent is gone, which cannot tell it any more."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

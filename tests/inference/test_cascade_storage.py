@@ -10,13 +10,14 @@ import pyro
 import pytest
 import torch
 from safetensors import safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 
 import pyro_dynogp as dgp
 from pyro_dynogp.fitting import Fit
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.storage import FORMAT
+from pyro_dynogp.support.checkpoints import write_tensors
 from tests.inference.cascades import FAST, wiener_record
 
 
@@ -204,7 +205,7 @@ def header_of(path):
 
 
 def rewrite(path, header):
-    save_file(load_file(str(path)), str(path), metadata={FORMAT: json.dumps(header)})
+    write_tensors(path, load_file(str(path)), {FORMAT: json.dumps(header)})
 
 
 @pytest.mark.parametrize(

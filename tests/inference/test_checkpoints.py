@@ -33,9 +33,9 @@ class Counter:
 class TestPiece:
     def test_is_computed_once_and_read_back(self, tmp_path):
         compute = Counter(0.1)
-        kept = Checkpoints.at(tmp_path / "deep" / "run", "identity")
+        kept = Checkpoints.at(tmp_path / "deep" / "run", model="identity")
         first = kept.piece("a", compute)
-        second = Checkpoints.at(tmp_path / "deep" / "run", "identity").piece("a", compute)
+        second = Checkpoints.at(tmp_path / "deep" / "run", model="identity").piece("a", compute)
         assert compute.calls == 1
         assert first.keys() == second.keys()
         assert all(torch.equal(first[k], second[k]) for k in first)
@@ -46,7 +46,7 @@ class TestPiece:
     def test_nothing_is_kept_without_a_folder(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         compute = Counter()
-        kept = Checkpoints.at(None, "identity")
+        kept = Checkpoints.at(None, model="identity")
         kept.piece("a", compute)
         kept.piece("a", compute)
         assert compute.calls == 2
@@ -55,29 +55,29 @@ class TestPiece:
     def test_no_gradient_and_no_memory_is_shared(self, tmp_path):
         x = torch.ones(3, requires_grad=True)
         # Two views of one storage: safetensors refuses them unless they are copied.
-        kept = Checkpoints.at(tmp_path, 1).piece("a", lambda: {"x": x[:2], "y": x[1:]})
+        kept = Checkpoints.at(tmp_path, seed=1).piece("a", lambda: {"x": x[:2], "y": x[1:]})
         assert not kept["x"].requires_grad
         kept["x"][0] = 9.0
         assert x[0] == 1.0
 
     def test_a_damaged_piece_is_named(self, tmp_path):
-        kept = Checkpoints.at(tmp_path, "identity")
+        kept = Checkpoints.at(tmp_path, model="identity")
         kept.piece("a", Counter())
         path = tmp_path / "a.safetensors"
         path.write_bytes(path.read_bytes()[:-9])
-        with pytest.raises(ValueError, match=r"a\.safetensors is damaged .* Remove it"):
+        with pytest.raises(ValueError, match=r"a\.safetensors is .* damaged .* Remove it"):
             kept.piece("a", Counter())
         path.unlink()
         assert kept.piece("a", Counter(2.0))["x"][0] == 2.0
 
     def test_the_folder_of_another_run_is_refused(self, tmp_path):
-        Checkpoints.at(tmp_path, "model", 0)
-        Checkpoints.at(tmp_path, "model", 0)
+        Checkpoints.at(tmp_path, model="model", seed=0)
+        Checkpoints.at(tmp_path, model="model", seed=0)
         with pytest.raises(ValueError, match="checkpoint: expected a new folder"):
-            Checkpoints.at(tmp_path, "model", 1)
+            Checkpoints.at(tmp_path, model="model", seed=1)
 
     def test_what_fails_or_is_cut_off_leaves_no_piece(self, tmp_path, monkeypatch):
-        kept = Checkpoints.at(tmp_path, "identity")
+        kept = Checkpoints.at(tmp_path, model="identity")
 
         def fails():
             raise RuntimeError("no result")
@@ -86,7 +86,7 @@ class TestPiece:
             kept.piece("a", fails)
         assert not (tmp_path / "a.safetensors").exists()
 
-        def half(tensors, path):  # the disk is full, or the process dies, in the middle
+        def half(tensors, path, metadata):  # the disk is full, or the process dies, in the middle
             Path(path).write_bytes(b"half")
             raise OSError("disk full")
 
@@ -94,7 +94,7 @@ class TestPiece:
             patch.setattr(checkpoints, "save_file", half)
             with pytest.raises(OSError, match="disk full"):
                 kept.piece("a", Counter())
-        assert not (tmp_path / "a.safetensors").exists()
+        assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
         assert kept.piece("a", Counter(5.0))["x"][0] == 5.0
 
     def test_text_survives(self):
@@ -173,7 +173,7 @@ def test_keeping_pieces_changes_nothing(method, guide, tmp_path, bent):
     kept = dgp.fit(wiener(), bent[:60], checkpoint=tmp_path, **options)
     assert same(plain, kept)
     assert not list(tmp_path.glob("*.part"))
-    assert json.loads((tmp_path / "run.json").read_text()).keys() == {"fingerprint"}
+    assert json.loads((tmp_path / "run.json").read_text()).keys() == {"fingerprint", "parts"}
 
 
 class Reached(Exception):  # noqa: N818

@@ -284,9 +284,9 @@ class TestErrors:
     @pytest.mark.parametrize(
         ("options", "message"),
         [
-            ({"outputs": 0}, "outputs: expected a whole number of at least one, got 0"),
+            ({"outputs": 0}, "outputs: expected a whole number >= 1, got 0"),
             ({"channels": 0}, "channels: expected a whole number"),
-            ({"inducing": 2.0}, "inducing: expected a whole number of at least one, got 2.0"),
+            ({"inducing": 2.0}, "inducing: expected a whole number >= 1, got 2.0"),
             ({"mean": "zero"}, "mean: expected 'constant' or 'linear', got 'zero'"),
             ({"kernel": "rbf"}, "kernel: expected a gpytorch kernel"),
             ({"locations": [[0.0, 1.0]]}, r"locations: .*shape \(count, 1\), got shape \(1, 2\)"),

@@ -314,9 +314,9 @@ class TestWiener:
         blank = past.select(outputs=[])
         with pytest.raises(ValueError, match="future: expected times after the end of past"):
             known.forecast(future, past)
-        with pytest.raises(ValueError, match="past: expected outputs to start from"):
+        with pytest.raises(ValueError, match="past: expected measured outputs"):
             known.forecast(blank, future)
-        with pytest.raises(ValueError, match="expected outputs to predict from"):
+        with pytest.raises(ValueError, match="record: expected measured outputs"):
             known.predict(blank)
         with pytest.raises(ValueError, match="horizon: expected a whole number >= 1"):
             known.predict(record, horizon=0)

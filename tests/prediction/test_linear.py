@@ -214,7 +214,7 @@ def test_wrong_uses(map_fit, record, two_outputs):
     blank = dgp.Record(time=past.time, inputs=past.inputs)
     with pytest.raises(ValueError, match="past: expected outputs"):
         map_fit.forecast(blank, future)
-    with pytest.raises(ValueError, match="expected outputs to predict from"):
+    with pytest.raises(ValueError, match="record: expected measured outputs"):
         map_fit.predict(blank)
 
 

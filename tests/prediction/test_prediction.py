@@ -1,5 +1,6 @@
 """Mixture moments, quantiles and densities; scores."""
 
+import dataclasses
 from dataclasses import replace
 
 import numpy as np
@@ -96,7 +97,7 @@ def scored(draws, n=400, seed=3):
     which = rng.integers(draws, size=n)
     index = np.arange(n)
     y = p.component_mean[which, index] + p.component_sd[which, index] * rng.standard_normal((n, 1))
-    return p, dgp.Record(time=p.time, outputs=y)
+    return p, dgp.Record(time=p.time, outputs=y, output_names=p.output_names)
 
 
 def test_scores_against_their_definitions():
@@ -209,7 +210,8 @@ def test_skip_and_missing_samples_are_left_out():
 
 def test_several_outputs_give_arrays():
     p = mixture(n=30)
-    record = dgp.Record(time=p.time, outputs=p.mean + np.array([0.1, 0.2]))
+    y = p.mean + np.array([0.1, 0.2])
+    record = dgp.Record(time=p.time, outputs=y, output_names=p.output_names)
     s = dgp.scores(p, record)
     np.testing.assert_allclose(s["rmse"], [0.1, 0.2])
     assert s["coverage_95"].shape == (2,)
@@ -219,12 +221,12 @@ def test_scores_refuse_what_does_not_belong_together():
     p, record = scored(1, n=20)
     with pytest.raises(ValueError, match="prediction: expected the 19 times"):
         dgp.scores(p, record[1:])
-    shifted = dgp.Record(time=record.time + 0.5, outputs=record.outputs)
+    shifted = dataclasses.replace(record, time=record.time + 0.5)
     with pytest.raises(ValueError, match="other times of the same number"):
         dgp.scores(p, shifted)
-    with pytest.raises(ValueError, match="skip: expected a number from 0 to 19"):
+    with pytest.raises(ValueError, match="skip: expected a whole number from 0 to 19"):
         dgp.scores(p, record, skip=20)
-    with pytest.raises(ValueError, match="record: expected 1 measured outputs"):
+    with pytest.raises(ValueError, match=r"record\.output_names: expected \[.a.\]"):
         dgp.scores(p, dgp.Record(time=record.time))
     with pytest.raises(ValueError, match="expected measured samples"):
         dgp.scores(p, record.with_outputs(np.full(20, np.nan)))
@@ -243,3 +245,23 @@ def test_shares_of_the_variance_are_computed_once_and_only_where_asked_for():
     assert len(parts) == 1
     assert parts["noise"].shape == (3, 1)
     assert len(calls) == 1
+
+
+def test_outputs_of_the_wrong_shape_are_refused_and_one_column_is_one_output():
+    """(n,) against (S, n, 1) would broadcast to (n, n)."""
+    p, record = scored(1, n=20)
+    for name in ("log_density", "probability_integral", "normal_scores"):
+        found = getattr(p, name)(record.outputs)
+        assert found.shape == (20, 1)
+        np.testing.assert_array_equal(getattr(p, name)(record.outputs[:, 0]), found)
+        for bad in (record.outputs[:19], record.outputs.T, np.zeros((20, 2)), 0.0, None, "text"):
+            with pytest.raises(ValueError, match="outputs: expected"):
+                getattr(p, name)(bad)
+
+
+def test_scores_in_other_units_are_refused():
+    p, record = scored(1, n=20)
+    p = dataclasses.replace(p, output_units=("kV",))
+    with pytest.raises(ValueError, match=r"record\.output_units: expected \['kV'\].*\['V'\]"):
+        dgp.scores(p, dataclasses.replace(record, output_units=("V",)))
+    dgp.scores(p, dataclasses.replace(record, output_units=("kV",)))

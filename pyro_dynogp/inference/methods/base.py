@@ -16,7 +16,11 @@ from pyro_dynogp.inference.posteriors import Posterior
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord, as_measured
+from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
+
+# Samples below which a record has no time scale.
+FEWEST = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +46,10 @@ class Problem:
             ValueError: as of `Model.check`; on constant or entirely missing signals.
         """
         checked = model.check(records)
+        longest = max(map(len, checked))
+        if longest < FEWEST:
+            expected = f"a record of {FEWEST} samples or more to fit to"
+            raise invalid("record", expected=expected, got=f"{longest} samples")
         scaling = Scaling.from_records(checked)
         prepared = tuple(PreparedRecord.of(record, scaling) for record in checked)
         learnt = None if start is None else dict(start.mode)
@@ -56,14 +64,6 @@ class Problem:
     def scaling(self) -> Scaling:
         """In whose units the model is fitted."""
         return self.records[0].scaling
-
-    @property
-    def identity(self) -> tuple[object, ...]:
-        """Everything that changes the result, with the same `repr` in every process."""
-        own = (self.model, [each.record.fingerprint for each in self.records])
-        if self.learnt is None:
-            return own
-        return (*own, {name: value.tolist() for name, value in self.learnt.items()})
 
     def fitted(
         self,
@@ -83,7 +83,7 @@ class Problem:
 
 
 class Method(Protocol):
-    """A method of inference. Its options are its fields."""
+    """A method of inference. Its options are its fields, and make checkpoints of it its own."""
 
     def check(self, model: Model, *, warm: bool) -> None:
         """Refuse a model that the method cannot fit, before any work.
@@ -94,11 +94,6 @@ class Method(Protocol):
         Raises:
             ValueError: where the two do not go together.
         """
-        ...
-
-    @property
-    def identity(self) -> object:
-        """Everything that changes the result, with the same `repr` in every process."""
         ...
 
     def __call__(self, problem: Problem, run: Run) -> Fitted:

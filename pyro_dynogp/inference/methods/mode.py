@@ -136,11 +136,6 @@ class Mode:
         """Every model has a mode; not every optimizer takes every model."""
         check_optimizer(self.optimizer, model)
 
-    @property
-    def identity(self) -> object:
-        """All options."""
-        return self
-
     def __call__(self, problem: Problem, run: Run) -> Fitted:
         """The mode and how it was found; steps of the run are those of each start."""
         optima = best_optima(problem, run, self.optimizer, run.steps)

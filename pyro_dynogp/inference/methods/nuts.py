@@ -19,10 +19,11 @@ from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.mode import best_optima, check_optimizer
 from pyro_dynogp.inference.optimise.maximum import Optimizer
 from pyro_dynogp.inference.posteriors import Sampled
-from pyro_dynogp.inference.run import Run, at_least_one
+from pyro_dynogp.inference.run import Run
 from pyro_dynogp.layers.sites import Program
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import Records
+from pyro_dynogp.support.errors import verify
 from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import child_seeds, parallel_map, seeded
 
@@ -67,17 +68,12 @@ class Nuts:
     optimizer: Optimizer | None = None
 
     def __post_init__(self) -> None:
-        at_least_one(chains=self.chains, warmup=self.warmup, draws=self.draws)
+        verify(chains=self.chains, warmup=self.warmup, draws=self.draws)
         check_optimizer(self.optimizer)
 
     def check(self, model: Model, *, warm: bool) -> None:
         """Every model can be sampled; not every optimizer finds its mode."""
         check_optimizer(self.optimizer, model)
-
-    @property
-    def identity(self) -> object:
-        """All options."""
-        return self
 
     def __call__(self, problem: Problem, run: Run) -> Fitted:
         """Draws of all chains, one after the other."""

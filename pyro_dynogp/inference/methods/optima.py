@@ -20,10 +20,10 @@ from pyro_dynogp.inference.methods.normal import VariationalPosterior, variation
 from pyro_dynogp.inference.methods.svi import Schedule
 from pyro_dynogp.inference.optimise.maximum import Optimizer, Optimum
 from pyro_dynogp.inference.posteriors import Mixture, draws_of_guide
-from pyro_dynogp.inference.run import Run, at_least_one
+from pyro_dynogp.inference.run import Run
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.support.checkpoints import Piece
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import invalid, verify
 from pyro_dynogp.support.parallel import parallel_map, seeded
 
 Values = dict[str, Tensor]
@@ -86,7 +86,7 @@ class Normal:
                 expected="'map', 'normal' or 'multivariate normal'",
                 got=repr(self.family),
             )
-        at_least_one(draws=self.draws, particles=self.particles)
+        verify(draws=self.draws, particles=self.particles, learning_rate=self.learning_rate)
         check_optimizer(self.optimizer)
 
     def check(self, model: Model, *, warm: bool) -> None:
@@ -98,11 +98,6 @@ class Normal:
                 expected="'normal' or 'multivariate normal' for a cascade without static layers",
                 got="'map'",
             )
-
-    @property
-    def identity(self) -> object:
-        """All options."""
-        return self
 
     def family_for(self, model: Model) -> Hyperparameters:
         """The family, where "auto" leaves it to the model."""

@@ -19,19 +19,18 @@ from pyro_dynogp.inference.methods.mode import starting_points
 from pyro_dynogp.inference.methods.svi import Schedule, Trained, train
 from pyro_dynogp.inference.methods.trajectory_guide import (
     GuideChoice,
-    identity_of,
     layer_guide,
     parameter_sites,
     starting_trajectories,
     with_trajectories,
 )
 from pyro_dynogp.inference.posteriors import Sampled
-from pyro_dynogp.inference.run import Run, at_least_one
+from pyro_dynogp.inference.run import Run
 from pyro_dynogp.layers.sites import Arguments, Program
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.support.checkpoints import Piece
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import invalid, verify
 from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import child_seeds, parallel_map, seeded
 
@@ -158,7 +157,7 @@ class Trajectories:
     learning_rate: float = 0.02
 
     def __post_init__(self) -> None:
-        at_least_one(draws=self.draws, particles=self.particles)
+        verify(draws=self.draws, particles=self.particles, learning_rate=self.learning_rate)
         if isinstance(self.guide, torch.nn.Module):
             raise invalid(
                 "guide",
@@ -182,11 +181,6 @@ class Trajectories:
             raise invalid("start", expected="None with this guide", got="a fit")
         if not self._written:
             layer_guide(self._target(model), self.guide, {}, 2)
-
-    @property
-    def identity(self) -> object:
-        """All options; a guide by its name and code, which are the same in every process."""
-        return (identity_of(self.guide), self.draws, self.particles, self.learning_rate)
 
     def _target(self, model: Model) -> Model:
         return replace(model, integrate="none") if self._written else with_trajectories(model)

@@ -100,21 +100,6 @@ def starting_trajectories(
     return out
 
 
-def identity_of(guide: GuideChoice) -> object:
-    """What tells one guide from another, the same in every process."""
-    if isinstance(guide, str):
-        return guide
-    if isinstance(guide, Mapping):
-        return sorted(guide.items())
-    named = guide if hasattr(guide, "__qualname__") else type(guide)
-    code = getattr(guide, "__code__", None)
-    body = None
-    if code is not None:
-        constants = tuple(c for c in code.co_consts if isinstance(c, int | float | str))
-        body = (code.co_code, code.co_names, constants)
-    return (named.__module__, named.__qualname__, body)
-
-
 def parameter_sites(model: Model, records: Sequence[PreparedRecord]) -> list[str]:
     """Names of the sites that the collapsed model has."""
     sites = model.collapsed.all_sites(records[0].scaling, len(records))

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from pyro_dynogp.inference.starts.dynamic import Values
 from pyro_dynogp.layers.functions import StaticFunction
+from pyro_dynogp.layers.kernels import KernelPrior
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.wiring import Static, Wire
 
@@ -61,6 +62,8 @@ def start_static(
     if layer.kernel is None:
         spread = (high - low) / (4.0 if d == 1 else 1.5)
         values[f"{name}_lengthscale"] = spread.clamp(0.1, 10.0)
+    for site in KernelPrior(name, layer.kernel, d).sites():  # of a kernel of the user's
+        values.setdefault(site.name, site.typical())
     values[f"{name}_values"] = torch.zeros(e, M, dtype=torch.float64)
     function = _function(model, one, layer, values)
     Z = function.locations
