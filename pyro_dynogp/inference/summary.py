@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.stability import warnings_of
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.models.wiring import Dynamic, Layer
 
@@ -27,6 +28,7 @@ def summary(fit: Fitted) -> str:
     if not model.likelihood.varying:
         sd = ", ".join(f"{value:.4g}" for value in fit.noise_sd)
         lines.append(f"measurement noise sd: {sd}")
+    lines.extend(f"warning: {sentence}" for sentence in warnings_of(fit))
     return "\n".join(lines)
 
 
