@@ -22,8 +22,10 @@ def _slow(fit: Fitted) -> list[str]:
     """Of the slowest pole of each dynamic layer."""
     unit, duration = fit.scaling.time_unit, float(fit.scaling.duration)
     found = []
-    for wire, layer in fit.system_at(fit.mode).dynamic:
-        pole = max(layer.modes.poles.tolist(), key=lambda pole: pole.real)
+    system = fit.system_at(fit.mode)
+    for (wire, layer), (_, made) in zip(system.dynamic, fit.model.dynamic, strict=True):
+        pairs = layer.modes.poles[: made.pairs].tolist()
+        pole = max(pairs, key=lambda pole: pole.real)
         held = -pole.real * duration
         if held < FEWEST:
             lasts = abs(pole.imag) > 2.0 * abs(pole.real)
@@ -35,7 +37,7 @@ def _slow(fit: Fitted) -> list[str]:
                 + (
                     "Add a Sinusoid channel if something outside oscillates"
                     if lasts
-                    else "Remove what drifts beside the plant"
+                    else "Set integrators=1 if the plant integrates, or remove what drifts beside it"
                 )
                 + ", take a longer record, or fewer pairs."
             )

@@ -54,7 +54,8 @@ def _layer(layer: Dynamic | Static, *, fed_back: bool) -> Part:
     if isinstance(layer, Dynamic):
         noise = "process noise" if layer.process_noise else "no process noise"
         pairs = f"{layer.pairs} pair{'s' if layer.pairs != 1 else ''} of poles"
-        return Part("dynamics", "linear dynamics", f"{pairs}, {noise}")
+        integrates = ", an integrator" if layer.integrators else ""
+        return Part("dynamics", "linear dynamics", f"{pairs}{integrates}, {noise}")
     limits = [f"{at:.4g}" for at in layer.limits or () if at is not None]
     stops = f", stops at {' and '.join(limits)}" if limits else ""
     heading = "static function in feedback" if fed_back else "static function"
