@@ -120,11 +120,11 @@ def energy(fit: Fit) -> float:
 
 
 def poles_of(fit: Fit) -> np.ndarray | None:
-    """Poles (P,) at the mode of a linear model [1/time unit]; None for a cascade."""
+    """Poles (P,) of the pairs of a linear model at its mode [1/time unit]; None for a cascade."""
     if not fit.model.is_linear:
         return None
-    ((_, layer),) = fit.system_at(fit.mode).dynamic
-    poles: np.ndarray = layer.modes.poles.numpy()
+    ((_, layer),), ((_, made),) = fit.system_at(fit.mode).dynamic, fit.model.dynamic
+    poles: np.ndarray = layer.modes.poles[: made.pairs].numpy()
     return poles
 
 

@@ -80,7 +80,8 @@ def silenced(
         model: with process noise, collapsed. records: of it. optimum: without.
         start: values of all sites of the model.
     """
-    off = {f"{w.name}_noise_gain_unit" for w, _ in model.dynamic if w.channels + w.fed}
+    driven = [w.name for w, _ in model.dynamic if w.channels + w.fed]
+    off = {f"{name}_{of}" for name in driven for of in ("noise_gain_unit", "integrator_noise")}
     values = grown(optimum.values, dict(start))
     values = {k: SILENT * v if k in off else v for k, v in values.items()}
     potential = Potential(model, (records,), values)

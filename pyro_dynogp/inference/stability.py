@@ -35,11 +35,11 @@ def _slow(fit: Fitted) -> list[str]:
                 f"Within this record it {'goes on oscillating' if lasts else 'all but integrates'}"
                 ", and forecasts with it are not to be trusted. "
                 + (
-                    "Add a Sinusoid channel if something outside oscillates"
+                    "Add a Sinusoid channel if something outside oscillates, "
                     if lasts
-                    else "Set integrators=1 if the plant integrates, or remove what drifts beside it"
+                    else "Set integrators=1 if the plant integrates, remove what drifts beside it, "
                 )
-                + ", take a longer record, or fewer pairs."
+                + "take a longer record, or fewer pairs."
             )
     return found
 

@@ -143,30 +143,3 @@ def autocovariance(modes: Modes, lag: Tensor) -> Tensor:
     S = torch.where((flat < 0)[:, None, None], S.mT, S)
     S = S.reshape(S.shape[:-3] + lag.shape + S.shape[-2:])
     return S if modes.several_outputs else S[..., 0, 0]
-
-
-def power_spectrum(modes: Modes, omega: Tensor) -> Tensor:
-    """Two-sided spectral density of the outputs that process noise causes.
-
-    Args:
-        modes: the system.
-        omega: angular frequencies (m,) [rad/s].
-
-    Returns:
-        (*b, m, n_y, n_y) [output^2 s], complex Hermitian, the Fourier transform of S(tau); without
-        the last two dimensions (and real) for a system with one output.
-    """
-    s = 1j * as_tensor(omega, device=modes.poles.device)
-    lam, C, L = modes.poles, modes.C, modes.L
-    direct = C.unsqueeze(-3) / (s[:, None] - lam.unsqueeze(-2)).unsqueeze(-2)  # *b, m, n_y, P
-    mirrored = C.conj().unsqueeze(-3) / (s[:, None] - lam.conj().unsqueeze(-2)).unsqueeze(-2)
-    Lm = L.unsqueeze(-3)
-    if modes.noise == "shared":
-        G = direct @ Lm + mirrored @ Lm.conj()
-    else:  # a Brownian motion of its own for each pair: pairs side by side
-        G = direct.unsqueeze(-1) * Lm.unsqueeze(-3) + mirrored.unsqueeze(-1) * Lm.conj().unsqueeze(
-            -3
-        )
-        G = G.flatten(-2)
-    S = G @ G.mH
-    return S if modes.several_outputs else S[..., 0, 0].real

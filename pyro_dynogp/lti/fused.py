@@ -30,12 +30,12 @@ def _covariances(
     Out of floating-point range they are infinite or NaN, as torch would have it: the factorisation
     refuses them.
     """
-    sums = (lam[:, :, None] + lam.conj()[:, None, :], lam[:, :, None] + lam[:, None, :])
+    pairs = (lam[:, :, None] + lam.conj()[:, None, :], lam[:, :, None] + lam[:, None, :])
+    sums = [np.where(s == 0, 1.0, s) for s in pairs]  # poles at zero are driven by nothing
     products = [L @ _transpose(L.conj()), L @ _transpose(L)]
     if not shared:
         same = np.eye(lam.shape[-1])
         products = [product * same for product in products]
-    sums = tuple(np.where(s == 0, 1.0, s) for s in sums)  # poles at zero, that nothing drives
     hermitian, symmetric = (-p / s for p, s in zip(products, sums, strict=True))
     q = _transpose(hermitian @ _transpose(C.conj()) + symmetric @ _transpose(C))
     return (*sums, *products, hermitian, symmetric, q)

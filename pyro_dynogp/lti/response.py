@@ -168,7 +168,9 @@ def mean_response(
             expected=f"shape (..., {modes.pairs}), one number for each pole",
             got=f"shape {tuple(x0.shape)}",
         )
-    if initial_state is None and not modes.inputs and modes.drift is None:  # at rest, and nothing moves it
+    if (
+        initial_state is None and not modes.inputs and modes.drift is None
+    ):  # at rest, and nothing moves it
         event = (len(grid), modes.outputs) if modes.several_outputs else (len(grid),)
         batch = broadcast(modes.batch_shape, u.shape[:-2])
         return Response(

@@ -10,7 +10,6 @@ from torch import Tensor
 from pyro_dynogp.lti.covariance import real_covariance
 from pyro_dynogp.lti.modes import Modes
 
-
 # Standard deviation of the level of an integrator at the first sample, in those of the outputs.
 LEVEL = 3.0
 

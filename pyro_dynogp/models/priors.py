@@ -217,7 +217,7 @@ class ModesPrior:
                 sites.append(Site(f"{name}_feedthrough", direct, over, growth=0.0))
         if self.process_noise:
             # The sign of a Brownian motion, and of a zero, cannot be seen in a covariance.
-            single = self.pairs == 1 or self.noise == "independent"
+            single = self.pairs + self.integrators == 1 or self.noise == "independent"
             sites += horseshoe_sites(
                 f"{name}_noise_gain", P, self.brownian, 2,
                 dims=named("pair", "brownian", "term"),
@@ -229,12 +229,15 @@ class ModesPrior:
             over = named("output", "pair", "part")
             sites.append(Site(f"{name}_output_gain", direction, over))
         if self.integrators:
-            brownian = self.brownian if self.process_noise else 0
-            for site, *more in (("drift",), ("gain", n_u, "input"), ("noise", brownian, "brownian")):
-                shape, over = (self.outputs or 1, *more[:1]), named("output", *more[1:])
-                if math.prod(shape):
-                    prior = _normal(FLAT if flat else 1.0, *shape)
-                    sites.append(Site(f"{name}_integrator_{site}", prior, over))
+            wide, n_y = FLAT if flat else 1.0, self.outputs or 1
+            prior = _normal(wide, n_y)
+            sites.append(Site(f"{name}_integrator_drift", prior, named("output")))
+            if n_u:
+                prior, over = _normal(wide, n_y, n_u), named("output", "input")
+                sites.append(Site(f"{name}_integrator_gain", prior, over, growth=0.0))
+            if self.process_noise:
+                prior, over = _normal(wide, n_y, self.brownian), named("output", "brownian")
+                sites.append(Site(f"{name}_integrator_noise", prior, over))
         return tuple(sites)
 
     def _pole_sites(self, dims: tuple[str, ...]) -> tuple[Site, Site]:
@@ -280,8 +283,13 @@ class ModesPrior:
         if D is not None and self.fed:
             D = torch.nn.functional.pad(D, (0, self.fed))
         return Modes(
-            poles=poles, input_gain=B, output_gain=c, noise_gain=L, feedthrough=D,
-            noise=self.noise, drift=drift,
+            poles=poles,
+            input_gain=B,
+            output_gain=c,
+            noise_gain=L,
+            feedthrough=D,
+            noise=self.noise,
+            drift=drift,
         )
 
     def _with_integrators(
