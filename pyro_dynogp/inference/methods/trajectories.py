@@ -15,7 +15,6 @@ from torch import Tensor
 
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.methods.base import Problem
-from pyro_dynogp.inference.methods.mode import starting_points
 from pyro_dynogp.inference.methods.svi import Schedule, Trained, train
 from pyro_dynogp.inference.methods.trajectory_guide import (
     GuideChoice,
@@ -27,6 +26,7 @@ from pyro_dynogp.inference.methods.trajectory_guide import (
 )
 from pyro_dynogp.inference.posteriors import Sampled
 from pyro_dynogp.inference.run import Run, at_least_one
+from pyro_dynogp.inference.starts.linear import starting_points
 from pyro_dynogp.layers.sites import Arguments, Program
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord
