@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.inference.methods.base import Method, Problem
 from pyro_dynogp.inference.methods.choose import method_of
 from pyro_dynogp.inference.run import Run
+from pyro_dynogp.inference.stability import warnings_of
 from pyro_dynogp.inference.summary import summary
 from pyro_dynogp.inference.training import train_model
 from pyro_dynogp.models.model import Model
@@ -242,7 +244,10 @@ def fit(
     run = Run(seed, workers, progress, restarts=restarts, steps=steps)
     chosen.check(model, warm=start is not None)
     problem = Problem.of(model, record, start)
-    return Fit.of(train_model(problem, chosen, run, checkpoint))
+    fitted = Fit.of(train_model(problem, chosen, run, checkpoint))
+    for sentence in warnings_of(fitted):
+        warnings.warn(f"fit: {sentence}", stacklevel=2)
+    return fitted
 
 
 @isolated

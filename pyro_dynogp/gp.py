@@ -21,13 +21,14 @@ class LTIParameters(gpytorch.Module):
     Give the same object to `LTIKernel` and `LTIMean` and they share it.
 
     Args:
-        modes: starting values, one output, no batch dimensions.
+        modes: starting values, one output, no batch dimensions, no integrators.
     """
 
     def __init__(self, modes: Modes) -> None:
         super().__init__()
-        if modes.batch_shape or modes.several_outputs:
-            raise invalid("modes", expected="one output and no batch dimensions", got=repr(modes))
+        if modes.batch_shape or modes.several_outputs or bool((modes.poles == 0).any()):
+            expected = "one output, no batch dimensions, stable poles"
+            raise invalid("modes", expected=expected, got=repr(modes))
         self.noise = modes.noise
         poles = modes.poles.detach()
         values = {

@@ -15,6 +15,7 @@ from pyro_dynogp.criticism.finding import Finding, apart
 from pyro_dynogp.criticism.posterior_draws import DRAWS, PosteriorDraws, draws_of, log_joint_of
 from pyro_dynogp.criticism.twin import twin_findings
 from pyro_dynogp.inference.isolation import isolated
+from pyro_dynogp.inference.stability import warnings_of
 from pyro_dynogp.prediction.predict import predict
 from pyro_dynogp.support.errors import invalid
 
@@ -86,6 +87,7 @@ def check(
       sites also that of the whole vector, high in many dimensions even where margins are good.
     - NUTS: R-hat, effective draws, divergences.
     - ELBO: whether it still rose at the end. Starts: whether another one came to the same optimum.
+    - Poles: those that hardly decay within the record, and records of unstable plants.
     - One-step predictions: calibrated on the training record (see `calibration`).
     - With `twin`: a fit of the same model, scaling and method to the first samples alone (from the
       optima of this fit), against NUTS on them. Means of the sites (unconstrained: logarithms of
@@ -120,6 +122,7 @@ def check(
     if fit.method == "svi":
         findings.append(_elbo(fit))
     findings.append(_starts(fit))
+    findings += [Finding("poles", np.nan, False, sentence) for sentence in warnings_of(fit)]
     findings += _predictions(fit) + compared
     return Check(tuple(findings), fit.method)
 

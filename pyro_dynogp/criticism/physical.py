@@ -17,7 +17,7 @@ from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.priors import numerators
 from pyro_dynogp.models.system import System
-from pyro_dynogp.models.wiring import Wire
+from pyro_dynogp.models.wiring import Dynamic, Wire
 from pyro_dynogp.support.tensors import as_tensor
 
 
@@ -28,7 +28,8 @@ def physical_quantities(
 
     Of each dynamic layer g ``g_decay_rate``, ``g_frequency``, ``g_time_constant`` (P,); of a model
     of one layer of dynamics with inputs ``g_pair_steady_state_gain``, ``g_pair_derivative_gain``
-    (P, n_y, n_u) and ``g_steady_state_gain`` (n_y, n_u), of all pairs and the feedthrough;
+    (P, n_y, n_u) and ``g_steady_state_gain`` (n_y, n_u), of all pairs and the feedthrough, or of
+    one with integrators ``g_integrator_rate`` (n_y, n_u), per unit of time;
     ``measurement_noise_sd`` (n_y,) where it is constant; ``output_offset`` (n_y,) but for a static
     last layer. Layers beside others have gains of no unit, which are left out.
 
@@ -38,9 +39,12 @@ def physical_quantities(
     """
     out: dict[str, Variable] = {}
     for wire, layer in system.dynamic:
-        out |= _poles(wire, layer.modes.expand((draws,)), scaling.time_unit)
+        assert isinstance(wire.layer, Dynamic)
+        poles = layer.modes.expand((draws,)).poles[:, : wire.layer.pairs]
+        out |= _poles(wire, poles, scaling.time_unit)
     if system.is_linear and model.inputs:
-        out |= _gains(system.physical(scaling).modes.expand((draws,)), scaling)
+        ((_, made),) = model.dynamic
+        out |= _gains(system.physical(scaling).modes.expand((draws,)), made, scaling)
     scale, shift = as_tensor(scaling.output_scale), as_tensor(scaling.output_offset)
     sd, offset = system.noise.constant_sd, system.offset
     for name, value in (
@@ -53,8 +57,8 @@ def physical_quantities(
     return out
 
 
-def _poles(wire: Wire, modes: Modes, unit: str) -> dict[str, Variable]:
-    decay, frequency = -modes.poles.real, modes.poles.imag
+def _poles(wire: Wire, poles: Tensor, unit: str) -> dict[str, Variable]:
+    decay, frequency = -poles.real, poles.imag
     dims = (wire.dims["pair"],)
     return {
         f"{wire.name}_decay_rate": Variable(decay.numpy(), dims, {"units": f"1/{unit}"}),
@@ -63,19 +67,24 @@ def _poles(wire: Wire, modes: Modes, unit: str) -> dict[str, Variable]:
     }
 
 
-def _gains(modes: Modes, scaling: Scaling) -> dict[str, Variable]:
-    S, P, n_y, n_u = modes.batch_shape[0], modes.pairs, modes.outputs, modes.inputs
+def _gains(modes: Modes, layer: Dynamic, scaling: Scaling) -> dict[str, Variable]:
+    S, P, n_y, n_u = modes.batch_shape[0], layer.pairs, modes.outputs, modes.inputs
     residue = modes.C.mT.unsqueeze(-1) * modes.B.unsqueeze(-2)
-    b = numerators(modes.poles, residue.reshape(S, P, n_y * n_u)).reshape(S, P, n_y, n_u, 2)
-    size = modes.poles.abs()[..., None, None]
+    rate = 2.0 * residue[:, P : P + layer.integrators * n_y].sum(1).real
+    poles, residue = modes.poles[:, :P], residue[:, :P].reshape(S, P, n_y * n_u)
+    b = numerators(poles, residue).reshape(S, P, n_y, n_u, 2)
+    size = poles.abs()[..., None, None]
     derivative, steady = b[..., 0] / size, b[..., 1] / size.square()
     total: Tensor = steady.sum(-3) + modes.D
     units = ratio_units(scaling.output_units, scaling.input_units)
     each: dict[str, tuple[Tensor, tuple[str, ...]]] = {
         "g_pair_derivative_gain": (derivative, ("pair", "output", "input")),
         "g_pair_steady_state_gain": (steady, ("pair", "output", "input")),
-        "g_steady_state_gain": (total, ("output", "input")),
     }
+    if layer.integrators:
+        each["g_integrator_rate"] = (rate, ("output", "input"))
+    else:
+        each["g_steady_state_gain"] = (total, ("output", "input"))
     return {k: Variable(_real(values), dims, units) for k, (values, dims) in each.items()}
 
 

@@ -199,37 +199,6 @@ def observed_of(fit: Fitted, record: PreparedRecord, index: int | None) -> Outpu
     return output_process(fit.model.begin(fit.system, states), record)
 
 
-@dataclass(frozen=True, eq=False)
-class ArraySubject:
-    """Densities that a user has computed, for targets that need no refit.
-
-    Attributes:
-        draws: of the posterior. densities: (S, N) by kind.
-        places: (N,) arrays. data: fingerprint.
-    """
-
-    draws: PosteriorDraws
-    densities: Mapping[str, np.ndarray]
-    places: Mapping[str, np.ndarray]
-    data: str
-
-    def pointwise(self, kind: Kind, horizon: int = 1) -> np.ndarray:
-        """Log-densities (S, N)."""
-        if kind not in self.densities or horizon != 1:
-            raise invalid(
-                "target", expected=f"one with densities, {list(self.densities)}", got=repr(kind)
-            )
-        return self.densities[kind]
-
-    def fresh(self, record: int, first: int, last: int) -> np.ndarray:
-        """Not known."""
-        raise no_refit()
-
-    def without(self, left_out: np.ndarray) -> Subject:
-        """Not known."""
-        raise no_refit()
-
-
 def no_refit() -> ValueError:
     """For a model whose author alone knows how it was fitted."""
     return invalid(

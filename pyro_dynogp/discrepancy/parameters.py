@@ -74,6 +74,8 @@ def _gains(fit: Fit, channels: Sequence[Channel], drawn: Mapping[str, Tensor]) -
     if not own or not fit.model.is_linear:
         return {}
     modes = fit.system_at(drawn).physical(fit.scaling).modes
+    if bool((modes.poles == 0).any()):  # an integrator has none
+        return {}
     gains = steady_state_gain(modes)[..., 0, :].numpy()
     scaling = fit.scaling
     return {

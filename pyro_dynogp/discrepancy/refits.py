@@ -11,13 +11,14 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.fitting import Fit
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.methods.base import Problem
-from pyro_dynogp.inference.methods.mode import at_optimum, climb, grow, starting_points
+from pyro_dynogp.inference.methods.mode import at_optimum, climb, grow
 from pyro_dynogp.inference.optimise.descent import descend
 from pyro_dynogp.inference.optimise.lockstep import Functions
 from pyro_dynogp.inference.optimise.maximum import Effort, Optimum, maximise
 from pyro_dynogp.inference.optimise.side_by_side import each_in_lockstep
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.dynamic import Values
+from pyro_dynogp.inference.starts.linear import starting_points
 from pyro_dynogp.inference.starts.poles import (
     grown,
     random_poles,
@@ -120,11 +121,11 @@ def energy(fit: Fit) -> float:
 
 
 def poles_of(fit: Fit) -> np.ndarray | None:
-    """Poles (P,) at the mode of a linear model [1/time unit]; None for a cascade."""
+    """Poles (P,) of the pairs of a linear model at its mode [1/time unit]; None for a cascade."""
     if not fit.model.is_linear:
         return None
-    ((_, layer),) = fit.system_at(fit.mode).dynamic
-    poles: np.ndarray = layer.modes.poles.numpy()
+    ((_, layer),), ((_, made),) = fit.system_at(fit.mode).dynamic, fit.model.dynamic
+    poles: np.ndarray = layer.modes.poles[: made.pairs].numpy()
     return poles
 
 

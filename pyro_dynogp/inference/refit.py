@@ -12,13 +12,13 @@ from torch import Tensor
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.methods.base import Problem
-from pyro_dynogp.inference.methods.mode import optimizer_for
 from pyro_dynogp.inference.methods.nuts import sample_posterior
 from pyro_dynogp.inference.methods.optima import POLISH, Hyperparameters, posterior_of
 from pyro_dynogp.inference.methods.svi import Schedule
 from pyro_dynogp.inference.optimise.maximum import Effort, Optimum, maximise
 from pyro_dynogp.inference.posteriors import Mixture, Sampled, draws_of_guide
 from pyro_dynogp.inference.run import Run
+from pyro_dynogp.inference.starts.linear import optimizer_for
 from pyro_dynogp.models.prepared import as_measured
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.stability import warnings_of
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.models.wiring import Dynamic, Known, Layer
 
@@ -23,7 +24,8 @@ def summary(fit: Fitted) -> str:
     for wire, layer in system.dynamic:
         if len(model.wires) > 1:
             lines.append(f"layer {wire.name}:")
-        lines.extend(_modes(layer.modes, unit))
+        assert isinstance(wire.layer, Dynamic)
+        lines.extend(_modes(layer.modes, wire.layer, unit))
     for wire in model.wires:
         for name in wire.layer.parameters if isinstance(wire.layer, Known) else ():
             draws = fit.draws[f"{wire.name}_{name}"]
@@ -31,20 +33,22 @@ def summary(fit: Fitted) -> str:
     if not model.likelihood.varying:
         sd = ", ".join(f"{value:.4g}" for value in fit.noise_sd)
         lines.append(f"measurement noise sd: {sd}")
+    lines.extend(f"warning: {sentence}" for sentence in warnings_of(fit))
     return "\n".join(lines)
 
 
 def _describe(layer: Layer) -> str:
     width = f", {layer.outputs} outputs" if layer.outputs > 1 else ""
     if isinstance(layer, Dynamic):
-        return f"dynamic, {layer.pairs} pairs{width}"
+        integrates = ", an integrator" if layer.integrators else ""
+        return f"dynamic, {layer.pairs} pairs{integrates}{width}"
     if isinstance(layer, Known):
         return f"known function{width}"
     return f"static, {layer.inducing} inducing values{width}"
 
 
-def _modes(modes: Modes, unit: str) -> list[str]:
-    frequency, damping = modes.natural_frequency, modes.damping
+def _modes(modes: Modes, layer: Dynamic, unit: str) -> list[str]:
+    frequency, damping = modes.natural_frequency[: layer.pairs], modes.damping
     return [
         f"  natural frequency {float(frequency[j]):10.4g} rad/{unit}"
         f"   damping {float(damping[j]):6.3f}"

@@ -5,7 +5,8 @@ The Lyapunov equation of a diagonal system has the solution (paper, Lemma 1)
     E[xi_a xi_b^H] = -L_a L_b^H / (lambda_a + conj lambda_b),
     E[xi_a xi_b^T] = -L_a L_b^T / (lambda_a + lambda_b),
 
-for all pairs a, b with shared noise, and for a = b alone with independent noise. The covariance of
+for all pairs a, b with shared noise, and for a = b alone with independent noise; nothing drives
+those with a pole at zero, whose covariances are zero. The covariance of
 the outputs at lag tau >= 0 is then a sum of damped sinusoids,
 
     S_ab(tau) = E[y_a(t + tau) y_b(t)] = 2 Re sum_j c_aj q_bj exp(lambda_j tau),
@@ -27,8 +28,8 @@ from pyro_dynogp.support.tensors import as_tensor
 def modal_covariance(modes: Modes) -> tuple[Tensor, Tensor]:
     """Stationary E[xi xi^H] and E[xi xi^T], each (*b, P, P), complex."""
     lam, L = modes.poles, modes.L
-    hermitian = -(L @ L.mH) / (lam.unsqueeze(-1) + lam.conj().unsqueeze(-2))
-    symmetric = -(L @ L.mT) / (lam.unsqueeze(-1) + lam.unsqueeze(-2))
+    hermitian = -(L @ L.mH) / apart_from_zero(lam.unsqueeze(-1) + lam.conj().unsqueeze(-2))
+    symmetric = -(L @ L.mT) / apart_from_zero(lam.unsqueeze(-1) + lam.unsqueeze(-2))
     if modes.noise == "independent":
         same = torch.eye(modes.pairs, dtype=torch.bool, device=lam.device)
         zero = torch.zeros((), dtype=hermitian.dtype, device=lam.device)
@@ -55,6 +56,17 @@ def complex_expm1(z: Tensor) -> Tensor:
     half = torch.sin(0.5 * b)
     real = torch.expm1(a) * torch.cos(b) - 2.0 * half * half
     return torch.complex(real, torch.exp(a) * torch.sin(b))
+
+
+def apart_from_zero(x: Tensor) -> Tensor:
+    """One in place of zero: for what has zero in the numerator there, too."""
+    return torch.where(x == 0, 1.0, x)
+
+
+def held_gain(poles: Tensor, step: Tensor | float) -> Tensor:
+    """What a held input adds to a state for each unit of B: (exp(lambda s) - 1)/lambda, s at 0."""
+    gain = complex_expm1(poles * step) / apart_from_zero(poles)
+    return torch.where(poles == 0, step, gain)
 
 
 def step_noise(modes: Modes, step: float) -> Tensor:
@@ -131,30 +143,3 @@ def autocovariance(modes: Modes, lag: Tensor) -> Tensor:
     S = torch.where((flat < 0)[:, None, None], S.mT, S)
     S = S.reshape(S.shape[:-3] + lag.shape + S.shape[-2:])
     return S if modes.several_outputs else S[..., 0, 0]
-
-
-def power_spectrum(modes: Modes, omega: Tensor) -> Tensor:
-    """Two-sided spectral density of the outputs that process noise causes.
-
-    Args:
-        modes: the system.
-        omega: angular frequencies (m,) [rad/s].
-
-    Returns:
-        (*b, m, n_y, n_y) [output^2 s], complex Hermitian, the Fourier transform of S(tau); without
-        the last two dimensions (and real) for a system with one output.
-    """
-    s = 1j * as_tensor(omega, device=modes.poles.device)
-    lam, C, L = modes.poles, modes.C, modes.L
-    direct = C.unsqueeze(-3) / (s[:, None] - lam.unsqueeze(-2)).unsqueeze(-2)  # *b, m, n_y, P
-    mirrored = C.conj().unsqueeze(-3) / (s[:, None] - lam.conj().unsqueeze(-2)).unsqueeze(-2)
-    Lm = L.unsqueeze(-3)
-    if modes.noise == "shared":
-        G = direct @ Lm + mirrored @ Lm.conj()
-    else:  # a Brownian motion of its own for each pair: pairs side by side
-        G = direct.unsqueeze(-1) * Lm.unsqueeze(-3) + mirrored.unsqueeze(-1) * Lm.conj().unsqueeze(
-            -3
-        )
-        G = G.flatten(-2)
-    S = G @ G.mH
-    return S if modes.several_outputs else S[..., 0, 0].real

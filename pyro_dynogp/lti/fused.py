@@ -30,7 +30,8 @@ def _covariances(
     Out of floating-point range they are infinite or NaN, as torch would have it: the factorisation
     refuses them.
     """
-    sums = (lam[:, :, None] + lam.conj()[:, None, :], lam[:, :, None] + lam[:, None, :])
+    pairs = (lam[:, :, None] + lam.conj()[:, None, :], lam[:, :, None] + lam[:, None, :])
+    sums = [np.where(s == 0, 1.0, s) for s in pairs]  # poles at zero are driven by nothing
     products = [L @ _transpose(L.conj()), L @ _transpose(L)]
     if not shared:
         same = np.eye(lam.shape[-1])
@@ -80,23 +81,24 @@ class _OutputCovariance(torch.autograd.Function):
 
 
 class _Propagators(torch.autograd.Function):
-    """exp(lambda d) and (exp(lambda d) - 1)/lambda for every step d."""
+    """exp(lambda d) and (exp(lambda d) - 1)/lambda for every step d; poles at zero are fixed."""
 
     @staticmethod
     def forward(ctx: Any, steps: np.ndarray, poles: Tensor) -> Any:
         lam = array(poles)[:, None, :]
         z = lam * steps[:, None]
         phi = np.exp(z)
-        gamma = np.expm1(z) / lam
-        ctx.arrays = steps, lam, phi, gamma
+        apart = np.where(lam == 0, 1.0, lam)
+        gamma = np.where(lam == 0, steps[:, None], np.expm1(z) / apart)
+        ctx.arrays = steps, apart, phi, gamma
         return torch.from_numpy(phi).to(poles.device), torch.from_numpy(gamma).to(poles.device)
 
     @staticmethod
     def backward(ctx: Any, *bars: Tensor) -> Any:
-        steps, lam, phi, gamma = ctx.arrays
+        steps, apart, phi, gamma = ctx.arrays
         phi_bar, gamma_bar = (array(b) for b in bars)
         moved = steps[:, None] * phi  # derivative of phi, and of lambda gamma
-        lam_bar = moved.conj() * phi_bar + ((moved - gamma) / lam).conj() * gamma_bar
+        lam_bar = moved.conj() * phi_bar + ((moved - gamma) / apart).conj() * gamma_bar
         return None, torch.from_numpy(lam_bar.sum(-2)).to(bars[0].device)
 
 

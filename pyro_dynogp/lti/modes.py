@@ -33,16 +33,20 @@ class Modes:
     ``output_gain``: of as many dimensions as ``poles`` for one output, of one more for several.
 
     Attributes:
-        poles: lambda (*b, P) [1/s], complex, one of each conjugate pair, real parts negative.
+        poles: lambda (*b, P) [1/s], complex, one of each conjugate pair, real parts negative; or
+            exactly zero, an integrator, whose noise gain is zero and whose other gains are real.
         input_gain: B (*b, P, n_u) [state/(input s)], complex; None for a system without input.
         output_gain: c (*b, P) or (*b, n_y, P) [output/state], complex.
         noise_gain: L (*b, P, n_l) [state/sqrt(s)], complex; None for no process noise.
         feedthrough: D (*b, n_u) or (*b, n_y, n_u) [output/input], real; None for zero.
+        drift: (*b, P) [state/s], complex: what drives the states beside the inputs, at any time the
+            same; None for nothing. (The input that keeps an integrator where it is is not zero.)
         noise: "shared", the same n_l Brownian motions drive all pairs; or "independent", each
             pair has n_l of its own.
 
     Raises:
-        ValueError: where shapes disagree, a number is not finite, or a pole is not stable.
+        ValueError: where shapes disagree, a number is not finite, or a pole is not stable (an
+            integrator that noise drives is not, either).
     """
 
     poles: Tensor
@@ -51,6 +55,7 @@ class Modes:
     noise_gain: Tensor | None = None
     feedthrough: Tensor | None = None
     noise: NoiseStructure = "shared"
+    drift: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.noise not in ("shared", "independent"):
@@ -93,6 +98,9 @@ class Modes:
             "noise_gain": L,
             "feedthrough": D,
         }
+        if self.drift is not None:
+            drift = as_tensor(self.drift, torch.complex128, poles.device)
+            fields["drift"] = self._gain("drift", drift.unsqueeze(-1), poles).squeeze(-1)
         # One number tells whether anything is not finite; which field it is, only an error asks.
         total = sum(value.detach().abs().sum() for value in fields.values())
         if not math.isfinite(float(total)):
@@ -104,19 +112,16 @@ class Modes:
                         got="NaN or infinity",
                         advice="If this came up in training, lower the learning rate or rescale.",
                     )
-        if not bool((poles.real < 0).all()):
+        if not bool((poles.real < 0).all()) and not _integrates(poles, L):
             worst = float(poles.real.detach().max())
             raise invalid(
                 "poles",
-                expected="stable poles, every real part below zero",
+                expected="stable poles, every real part below zero, or zeros without noise",
                 got=f"a real part of {worst:.6g} 1/s",
                 advice="A stationary Gaussian process needs a stable system.",
             )
-        object.__setattr__(self, "poles", poles)
-        object.__setattr__(self, "input_gain", B)
-        object.__setattr__(self, "output_gain", c)
-        object.__setattr__(self, "noise_gain", L)
-        object.__setattr__(self, "feedthrough", D)
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
         object.__setattr__(self, "_several", several)
         try:
             batch = broadcast(
@@ -125,6 +130,7 @@ class Modes:
                 c.shape[: c.dim() - 1 - several],
                 L.shape[:-2],
                 D.shape[: D.dim() - 1 - several],
+                () if self.drift is None else self.drift.shape[:-1],
             )
         except ValueError as error:
             raise invalid(
@@ -222,6 +228,7 @@ class Modes:
             noise_gain=function(self.L, 2),
             feedthrough=function(cast(Tensor, self.feedthrough), 1 + several),
             noise=self.noise,
+            drift=None if self.drift is None else function(self.drift, 1),
         )
 
     def expand(self, batch_shape: torch.Size | tuple[int, ...]) -> Modes:
@@ -273,6 +280,7 @@ class Modes:
             noise_gain=self.L / time**0.5,
             feedthrough=D if several else D.squeeze(-2),
             noise=self.noise,
+            drift=None if self.drift is None else self.drift / time,
         )
 
     def __repr__(self) -> str:
@@ -281,3 +289,10 @@ class Modes:
             f"Modes({self.pairs} pairs, {self.inputs} inputs, {self.outputs} outputs, "
             f"{self.L.shape[-1]} {self.noise} noise{shape})"
         )
+
+
+def _integrates(poles: Tensor, noise_gain: Tensor) -> bool:
+    """Whether all poles that are not stable are zero, and not driven by noise."""
+    zero = poles == 0
+    driven = bool((zero.unsqueeze(-1) & (noise_gain != 0)).any())
+    return bool(((poles.real < 0) | zero).all()) and not driven

@@ -1,7 +1,7 @@
 """The compiled recursions as differentiable torch functions with broadcast batch dimensions.
 
 Compiled code runs on the processor: tensors that live on an accelerator are moved there and the
-result is moved back. For small problems on an accelerator use `pyro_dynogp.lti.dense`.
+result is moved back. For small problems on an accelerator use `pyro_dynogp.gp.LTIKernel`.
 """
 
 from __future__ import annotations

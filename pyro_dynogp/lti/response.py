@@ -23,7 +23,7 @@ from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.primitives import array, flatten_batch, run
 from pyro_dynogp.support.compiled import OPTIONS
 from pyro_dynogp.support.errors import invalid
-from pyro_dynogp.support.tensors import Numbers, as_tensor, broadcast
+from pyro_dynogp.support.tensors import Numbers, as_tensor, broadcast, joined
 
 
 @njit(**OPTIONS)
@@ -168,7 +168,9 @@ def mean_response(
             expected=f"shape (..., {modes.pairs}), one number for each pole",
             got=f"shape {tuple(x0.shape)}",
         )
-    if initial_state is None and not modes.inputs:  # at rest, and nothing moves it
+    if (
+        initial_state is None and not modes.inputs and modes.drift is None
+    ):  # at rest, and nothing moves it
         event = (len(grid), modes.outputs) if modes.several_outputs else (len(grid),)
         batch = broadcast(modes.batch_shape, u.shape[:-2])
         return Response(
@@ -176,7 +178,11 @@ def mean_response(
             x0.expand((*batch, modes.pairs)),
         )
     phi, gamma = propagators(modes, grid.steps)
-    args = [phi, gamma, modes.B, modes.C, u, x0]
+    B, driving = modes.B, u
+    if modes.drift is not None:  # as an input that is always one
+        B = joined([B, modes.drift.unsqueeze(-1)], 2, -1)
+        driving = joined([u, torch.ones_like(grid.time).unsqueeze(-1)], 2, -1)
+    args = [phi, gamma, B, modes.C, driving, x0]
     flat, batch = flatten_batch(args, [2, 2, 2, 2, 2, 1])
     y, end = run(_Scan, (grid.step_index,), *flat)
     y = y.reshape(batch + y.shape[1:])

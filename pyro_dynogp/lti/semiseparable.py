@@ -247,29 +247,6 @@ class SemiseparableCovariance:
         self._refuse_missing("matmul")
         return self.signal_matmul(X) + self.noise_variance.unsqueeze(-1) * X
 
-    def cross_matmul(self, time: Numbers | TimeGrid, X: Tensor) -> Tensor:
-        """S(T*, T) X (*b, N*, R) for other times T* (never decreasing)."""
-        other = time_grid(time).time
-        if self.initial_covariance is not None and bool(other[0] < self.grid.time[0]):
-            raise invalid(
-                "time",
-                expected=f"times from {float(self.grid.time[0])} on, where the state is given",
-                got=f"{float(other[0])}",
-            )
-        n_y = self.modes.outputs
-        merged = torch.cat([self.grid.time, other])
-        order = torch.argsort(merged, stable=True)
-        place = torch.argsort(order)
-        rows = (place.unsqueeze(-1) * n_y + torch.arange(n_y, device=place.device)).reshape(-1)
-        mine, theirs = rows[: self.size], rows[self.size :]
-        padded = torch.zeros(
-            *X.shape[:-2], merged.shape[0] * n_y, X.shape[-1], dtype=X.dtype, device=X.device
-        ).index_copy(-2, mine, X)
-        both = SemiseparableCovariance(
-            self.modes, merged[order], 0.0, initial_covariance=self.initial_covariance
-        )
-        return both.signal_matmul(padded)[..., theirs, :]
-
     def inverse_diagonal(self) -> Tensor:
         """Diagonal of K^{-1} (*b, N); zero in missing rows."""
         e, _, d, _, _ = self._factor

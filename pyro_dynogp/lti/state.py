@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pyro_dynogp.lti.covariance import complex_expm1, state_covariance, step_noise
+from pyro_dynogp.lti.covariance import held_gain, state_covariance, step_noise
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.support.errors import invalid
 
@@ -64,12 +64,14 @@ def propagate(
     """
     if step < 0:
         raise invalid("step", expected="a length >= 0", got=f"{step}")
-    z = modes.poles * step
-    phi = torch.exp(z)
+    phi = torch.exp(modes.poles * step)
     mean = phi * state.mean
+    gain = held_gain(modes.poles, step)
     if held_input is not None and modes.inputs:
         drive = (modes.B @ held_input.to(modes.B.dtype).unsqueeze(-1)).squeeze(-1)
-        mean = mean + complex_expm1(z) / modes.poles * drive
+        mean = mean + gain * drive
+    if modes.drift is not None:
+        mean = mean + gain * modes.drift
     if state.covariance is None:
         return ModalState(mean, state_covariance(modes))
     F = real_propagator(phi)

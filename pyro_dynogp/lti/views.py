@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pyro_dynogp.lti.covariance import complex_expm1, state_covariance, step_noise
+from pyro_dynogp.lti.covariance import held_gain, state_covariance, step_noise
 from pyro_dynogp.lti.fused import propagators
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.state import real_propagator
@@ -166,7 +166,7 @@ def step_response(modes: Modes, time: Numbers) -> Tensor:
     """Response (*b, m, n_y, n_u) [output/input] to a unit step at 0; time (m,) [s] since it."""
     t = as_tensor(time, device=modes.poles.device)
     lam = modes.poles.unsqueeze(-2)
-    grown = complex_expm1(lam * t.clamp_min(0.0).unsqueeze(-1)) / lam
+    grown = held_gain(lam, t.clamp_min(0.0).unsqueeze(-1))
     h = 2.0 * ((modes.C.unsqueeze(-3) * grown.unsqueeze(-2)) @ modes.B.unsqueeze(-3)).real
     h = h + modes.D.unsqueeze(-3)
     return torch.where((t < 0)[:, None, None], torch.zeros_like(h), h)

@@ -23,6 +23,7 @@ def LinearDynamicGP(
     brownian: int | None = None,
     feedthrough: bool = True,
     process_noise: bool = True,
+    integrators: int = 0,
     likelihood: Likelihood | None = None,
     **options: Unpack[ModelOptions],
 ) -> Model:
@@ -38,6 +39,8 @@ def LinearDynamicGP(
         brownian: n_l, number of Brownian motions; by default n_y.
         feedthrough: whether the input acts on the output at once.
         process_noise: whether there is any.
+        integrators: 1 for a pole at zero beside the pairs, one for each output: of a plant that
+            integrates its input (a level, a position, a charge).
         likelihood: Gaussian by default.
         options: of `Model`: initial_state, priors, direct, channels, scaling.
 
@@ -51,6 +54,7 @@ def LinearDynamicGP(
         brownian=brownian,
         feedthrough=feedthrough,
         process_noise=process_noise,
+        integrators=integrators,
     )
     options = {"integrate": "all", **options}
     return Model(inputs, (layer,), likelihood or Gaussian(), **options)

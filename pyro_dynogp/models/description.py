@@ -54,7 +54,8 @@ def _layer(layer: Layer, *, fed_back: bool) -> Part:
     if isinstance(layer, Dynamic):
         noise = "process noise" if layer.process_noise else "no process noise"
         pairs = f"{layer.pairs} pair{'s' if layer.pairs != 1 else ''} of poles"
-        return Part("dynamics", "linear dynamics", f"{pairs}, {noise}")
+        integrates = ", an integrator" if layer.integrators else ""
+        return Part("dynamics", "linear dynamics", f"{pairs}{integrates}, {noise}")
     if isinstance(layer, Known):
         heading = "known function in feedback" if fed_back else "known function"
         return Part("function", heading, ", ".join(layer.parameters))

@@ -115,7 +115,7 @@ class Model(Structure):
         sites = []
         for w, layer in self.dynamic:
             if w in self.state_sites:
-                zero = torch.zeros(2 * layer.pairs, dtype=torch.float64)
+                zero = torch.zeros(2 * layer.modes, dtype=torch.float64)
                 prior = dist.Normal(zero, zero + 1.0).to_event(1)
                 name, dims = f"{w.name}_initial_state{suffix}", (w.dims["state"],)
                 sites.append(Site(name, prior, dims, role="free", growth=0.0))
@@ -198,6 +198,7 @@ class Model(Structure):
             time_scale=time_scale,
             priors=self.priors,
             fed=place.fed,
+            integrators=layer.integrators,
         )
 
     @staticmethod
@@ -254,7 +255,7 @@ class Model(Structure):
         """The system at the beginning of a record, as `initial_state` has it."""
         if self.initial_state == "zero":
             zeros = {
-                w.name: torch.zeros(2 * layer.pairs, dtype=torch.float64)
+                w.name: torch.zeros(2 * layer.modes, dtype=torch.float64)
                 for w, layer in self.dynamic
             }
             return system.after(zeros)

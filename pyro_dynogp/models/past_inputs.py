@@ -10,21 +10,32 @@ from torch import Tensor
 from pyro_dynogp.lti.covariance import real_covariance
 from pyro_dynogp.lti.modes import Modes
 
+# Standard deviation of the level of an integrator at the first sample, in those of the outputs.
+LEVEL = 3.0
+
 
 def past_input_covariance(modes: Modes, memory: float, inputs: int | None = None) -> Tensor:
     """Covariance (*b, 2P, 2P) of [Re x; Im x] after unknown past inputs of unit variance.
 
     Each input is taken as the sum of a random constant, which holds the state at -B/lambda, and
     of white noise of intensity 2 memory, as of an input that forgets within `memory` [s]. Only the
-    first `inputs` count, where that is given: what a loop feeds back comes from no outside.
+    first `inputs` count, where that is given: what a loop feeds back comes from no outside. An
+    integrator remembers inputs of all times: its state 2 x has the standard deviation `LEVEL`.
     """
     lam, B = modes.poles, modes.B[..., :inputs]
+    integrates = lam == 0
+    if bool(integrates.any()):
+        lam = torch.where(integrates, -1.0, lam)
+        B = B.masked_fill(integrates.unsqueeze(-1), 0.0)
+        level = torch.where(integrates, (0.5 * LEVEL) ** 2, 0.0)
+        levels = torch.diag_embed(torch.cat([level, torch.zeros_like(level)], -1))
     held = B / lam.unsqueeze(-1)
     hermitian = held @ held.mH - 2.0 * memory * (B @ B.mH) / (
         lam.unsqueeze(-1) + lam.conj().unsqueeze(-2)
     )
     symmetric = held @ held.mT - 2.0 * memory * (B @ B.mT) / (lam.unsqueeze(-1) + lam.unsqueeze(-2))
-    return real_covariance(hermitian, symmetric)
+    covariance = real_covariance(hermitian, symmetric)
+    return covariance + levels if bool(integrates.any()) else covariance
 
 
 def initial_mean(covariance: Tensor, standard: Tensor) -> Tensor:

@@ -33,6 +33,7 @@ from pyro_dynogp.layers.sites import Site, Values, sample
 from pyro_dynogp.lti.modes import Modes, NoiseStructure
 from pyro_dynogp.models.horseshoe import horseshoe, horseshoe_sites
 from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.tensors import joined
 
 PriorName = Literal["default", "paper"]
 
@@ -45,6 +46,9 @@ CRITICAL = 0.02
 SETTLING = 10.0
 # Standard deviation of a prior that is flat for all practical purposes.
 FLAT = 1e3
+# Of the random walk beside an integrator: its rate, per record, and how far it gets within one, in
+# standard deviations of the outputs, a priori.
+WALK, WALKED = 0.01, 0.1
 # What is left of new noise gains where a model is extended: not nothing, since at zero the density
 # has no slope.
 QUIET = 0.05
@@ -132,6 +136,15 @@ class ModesPrior:
       imitate measurement noise needs a large, unlikely one. Where only the squares of n1 and n0
       matter (one output; one pair, or independent noise; n_l = 1) they are positive.
     - ``output_gain`` (n_y, P, 2)*: direction of c, only for several outputs; normal(0, 1).
+    - ``integrator_gain`` (n_y, n_u)*: rate of each output's integrator for each input over the
+      typical rate, normal(0, 1): with one, inputs that change from sample to sample move the level
+      by a standard deviation within the record. Its pole is zero, and its level at the first sample
+      unknown (`past_input_covariance`).
+    - ``integrator_drift`` (n_y,)*: the same of what drives it beside the inputs, always (the input
+      that keeps the level is not the mean of the record's).
+    - ``integrator_noise`` (n_y, n_l)*: the random walk of the level, how far it gets within the
+      record over 0.1 standard deviations, normal(0, 1). It is a pair of its own without inputs,
+      whose real pole lets it forget within a hundred lengths of the record.
 
     Attributes:
         name: prefix of the sites.
@@ -141,6 +154,7 @@ class ModesPrior:
         noise: "shared" or "independent", see `Modes`.
         feedthrough: whether there is a direct path D.
         fed: how many of the inputs, the last ones, come back and have no direct path.
+        integrators: 1 for an integrator of each output, else 0.
         process_noise: whether there is process noise at all.
         time_scale: step and duration of the record [s].
         gain_scale: of the gains of an input a priori.
@@ -162,6 +176,7 @@ class ModesPrior:
     gain_scale: float = GAIN_SCALE
     priors: PriorName = "default"
     fed: int = 0
+    integrators: int = 0
 
     def __post_init__(self) -> None:
         if self.priors not in ("default", "paper"):
@@ -202,7 +217,7 @@ class ModesPrior:
                 sites.append(Site(f"{name}_feedthrough", direct, over, growth=0.0))
         if self.process_noise:
             # The sign of a Brownian motion, and of a zero, cannot be seen in a covariance.
-            single = self.pairs == 1 or self.noise == "independent"
+            single = self.pairs + self.integrators == 1 or self.noise == "independent"
             sites += horseshoe_sites(
                 f"{name}_noise_gain", P, self.brownian, 2,
                 dims=named("pair", "brownian", "term"),
@@ -213,6 +228,16 @@ class ModesPrior:
             direction = _normal(1.0, self.outputs, P, 2)
             over = named("output", "pair", "part")
             sites.append(Site(f"{name}_output_gain", direction, over))
+        if self.integrators:
+            wide, n_y = FLAT if flat else 1.0, self.outputs or 1
+            prior = _normal(wide, n_y)
+            sites.append(Site(f"{name}_integrator_drift", prior, named("output")))
+            if n_u:
+                prior, over = _normal(wide, n_y, n_u), named("output", "input")
+                sites.append(Site(f"{name}_integrator_gain", prior, over, growth=0.0))
+            if self.process_noise:
+                prior, over = _normal(wide, n_y, self.brownian), named("output", "brownian")
+                sites.append(Site(f"{name}_integrator_noise", prior, over))
         return tuple(sites)
 
     def _pole_sites(self, dims: tuple[str, ...]) -> tuple[Site, Site]:
@@ -240,7 +265,7 @@ class ModesPrior:
         # The floor is as good as a double real pole (relative error 4e-4); residues stay finite.
         frequency = (undamped.square() + (CRITICAL * decay).square()).sqrt()
         poles = torch.complex(-decay, frequency)
-        B = L = None
+        B = L = drift = None
         if self.inputs:
             gain = values[f"{name}_input_gain"]
             B = residues(poles, _section(poles, gain) * poles.abs()[..., None, None])
@@ -252,12 +277,44 @@ class ModesPrior:
             c = c.expand(poles.shape)
         else:
             c = unit_direction(_complex(values[f"{name}_output_gain"]))
+        if self.integrators:
+            poles, B, c, L, drift = self._with_integrators(values, poles, B, c, L)
         D = values.get(f"{name}_feedthrough")
         if D is not None and self.fed:
             D = torch.nn.functional.pad(D, (0, self.fed))
         return Modes(
-            poles=poles, input_gain=B, output_gain=c, noise_gain=L, feedthrough=D, noise=self.noise
+            poles=poles,
+            input_gain=B,
+            output_gain=c,
+            noise_gain=L,
+            feedthrough=D,
+            noise=self.noise,
+            drift=drift,
         )
+
+    def _with_integrators(
+        self, values: Values, poles: Tensor, B: Tensor | None, c: Tensor, L: Tensor | None
+    ) -> tuple[Tensor, Tensor | None, Tensor, Tensor | None, Tensor]:
+        """Poles and gains with an integrator for each output, then a random walk for each."""
+        n_y, duration = self.outputs or 1, self.time_scale.duration
+        rates = [0.0] if L is None else [0.0, -WALK / duration]
+        new = torch.tensor(rates, dtype=torch.float64).repeat_interleave(n_y).to(poles)
+        scale = 0.5 * self.time_scale.typical_rate
+        silent = torch.zeros(1, 1, dtype=torch.complex128)
+        poles = joined([poles, new], 1, -1)
+        own = torch.eye(n_y).repeat(1, len(rates)).to(c)
+        c = joined([c, own[0] if self.outputs is None else own], 1 + (self.outputs is not None), -1)
+        if B is not None:
+            gain = scale * values[f"{self.name}_integrator_gain"]
+            rest = silent.expand((len(rates) - 1) * n_y, self.inputs)
+            B = joined([B, gain.to(B), rest], 2, -2)
+        if L is not None:
+            walk = values[f"{self.name}_integrator_noise"] * 0.5 * WALKED / math.sqrt(duration)
+            L = joined([L, silent.expand(n_y, self.brownian), walk.to(L)], 2, -2)
+        rate = scale * values[f"{self.name}_integrator_drift"]
+        still = torch.zeros(self.pairs), rate, torch.zeros((len(rates) - 1) * n_y)
+        drift = joined([x.to(poles) for x in still], 1, -1)
+        return poles, B, c, L, drift
 
 
 def sample_modes(

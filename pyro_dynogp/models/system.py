@@ -21,7 +21,7 @@ from pyro_dynogp.models.known import KnownFunction
 from pyro_dynogp.models.past_inputs import initial_mean, past_input_covariance, with_direct
 from pyro_dynogp.models.wiring import INPUTS, Wire
 from pyro_dynogp.support.errors import invalid
-from pyro_dynogp.support.tensors import Numbers, as_tensor, broadcast
+from pyro_dynogp.support.tensors import Numbers, as_tensor, broadcast, joined
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,7 +292,4 @@ class System:
 def see(signals: dict[str, Tensor], place: Wire) -> Tensor:
     """What a layer sees (*b, n, channels): its sources side by side."""
     parts = [signals[name] for name in place.sources]
-    if len(parts) == 1:
-        return parts[0]
-    batch = broadcast(*(p.shape[:-2] for p in parts))
-    return torch.cat([p.expand(batch + p.shape[-2:]) for p in parts], -1)
+    return parts[0] if len(parts) == 1 else joined(parts, 2, -1)

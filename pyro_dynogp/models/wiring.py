@@ -28,6 +28,8 @@ class Dynamic:
         brownian: number of Brownian motions; by default one for each output.
         feedthrough: whether the layer's input acts on its output at once.
         process_noise: whether there is any.
+        integrators: 1 for a pole at zero beside the pairs, one for each output: of a plant that
+            integrates its input (a level, a position, a charge).
         skip: names of earlier signals ("inputs", or layers) that the layer sees beside the
             output of the layer before it.
         feedback: names of later static layers whose outputs are further inputs of this layer. Each
@@ -42,9 +44,15 @@ class Dynamic:
     brownian: int | None = None
     feedthrough: bool = True
     process_noise: bool = True
+    integrators: int = 0
     skip: tuple[str, ...] = ()
     feedback: tuple[str, ...] = ()
     name: str | None = None
+
+    @property
+    def modes(self) -> int:
+        """Number of poles that stand for pairs: an integrator counts, and its random walk."""
+        return self.pairs + self.integrators * self.outputs * (2 if self.process_noise else 1)
 
 
 @dataclass(frozen=True)
@@ -306,6 +314,12 @@ def _check_layer(name: str, layer: Layer) -> None:
                 f"noise of layer {name!r}",
                 expected="'shared' or 'independent'",
                 got=repr(layer.noise),
+            )
+        if layer.integrators not in (0, 1):
+            raise invalid(
+                f"integrators of layer {name!r}",
+                expected="0, or 1 for one of each output",
+                got=repr(layer.integrators),
             )
     elif isinstance(layer, Known):
         low, high = layer.range or (0.0, 1.0)

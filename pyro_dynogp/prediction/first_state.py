@@ -66,7 +66,7 @@ def estimate(fit: Fitted, record: PreparedRecord) -> dict[str, Tensor]:
     head = PreparedRecord.of(record.record[:SAMPLES], record.scaling)
     system = fit.system_at(fit.mode)
     seen = model.seen_by_functions
-    sizes = {wire.name: 2 * layer.pairs for wire, layer in model.dynamic if wire in seen}
+    sizes = {wire.name: 2 * layer.modes for wire, layer in model.dynamic if wire in seen}
     total = sum(sizes.values())
     if not total:
         return {}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
@@ -30,6 +30,12 @@ def broadcast(*shapes: Iterable[int]) -> torch.Size:
             elif size not in (1, sizes[i]):
                 raise ValueError(f"shapes {[tuple(s) for s in shapes]} do not broadcast")
     return torch.Size(sizes)
+
+
+def joined(parts: Sequence[Tensor], events: int, dim: int) -> Tensor:
+    """One after the other along `dim`, one of the last `events` dimensions; others broadcast."""
+    batch = broadcast(*(part.shape[: part.dim() - events] for part in parts))
+    return torch.cat([x.expand(batch + x.shape[x.dim() - events :]) for x in parts], dim)
 
 
 def as_tensor(

@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 from statsmodels.tsa.statespace.mlemodel import MLEModel
 
 from pyro_dynogp import LTIKernel, LTIParameters, LTIProcess, Modes
-from pyro_dynogp.lti.dense import DenseCovariance
 from pyro_dynogp.lti.views import discrete_state_space
+from tests.lti.dense import DenseCovariance
 
 STEP = 0.05
 NOISE_SD = 0.3

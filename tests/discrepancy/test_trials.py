@@ -14,9 +14,10 @@ from pyro_dynogp.discrepancy.refits import quick_fit
 from pyro_dynogp.discrepancy.trials import held_out_density
 from pyro_dynogp.inference.methods import mode as cascade_fit
 from pyro_dynogp.inference.methods.base import Problem
-from pyro_dynogp.inference.methods.mode import grow, starting_points
+from pyro_dynogp.inference.methods.mode import grow
 from pyro_dynogp.inference.optimise.maximum import maximise
 from pyro_dynogp.inference.run import Run
+from pyro_dynogp.inference.starts.linear import starting_points
 from pyro_dynogp.inference.starts.poles import grown
 from pyro_dynogp.models.variants import with_channel, with_pairs, without_process_noise
 from tests.discrepancy.made import SETTINGS, coloured

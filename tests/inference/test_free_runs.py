@@ -1,4 +1,7 @@
-"""Free runs over blocks: what they measure, and what is decided on them."""
+"""Fits of cascades are chosen by their free runs, too: the rules, and that they hold."""
+
+import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -6,9 +9,96 @@ import torch
 
 import pyro_dynogp as dgp
 from pyro_dynogp.inference import free_runs
-from pyro_dynogp.inference.optimise.maximum import Optimum
+from pyro_dynogp.inference.free_runs import free_run_error, noise_pays
+from pyro_dynogp.inference.methods import mode
+from pyro_dynogp.inference.run import Run
 from pyro_dynogp.models.outputs import output_process
 from tests.models.closed_loops import ClosedLoop, make_record, spring, system_at, values_of
+
+LINE = 0.5
+
+
+def optimum(energy, error):
+    return SimpleNamespace(energy=energy, values=error)
+
+
+def chosen(monkeypatch, *attempts, model=None):
+    """Optima that `cascade_optima` returns of given (energy, free-run error) by attempt."""
+    model = model or dgp.Wiener(1)
+    problem = SimpleNamespace(target=model, records=[], learnt=None)
+    twin = (dgp.LinearDynamicGP(1), [], [LINE])
+    left = list(attempts)
+    monkeypatch.setattr(mode, "linear_twins", lambda *_: {"g": twin})
+    monkeypatch.setattr(mode, "spread", lambda *_: [{}])
+    monkeypatch.setattr(mode, "free_run_error", lambda model, values, records: values)
+    monkeypatch.setattr(mode, "climb", lambda *_, **__: [optimum(*one) for one in left.pop(0)])
+    found = mode.cascade_optima(problem, Run(0, 1, False), "adam", 10)
+    return [(one.energy, one.values) for one in found], len(attempts) - len(left)
+
+
+@pytest.mark.parametrize("model", [dgp.Wiener(1), dgp.Hammerstein(1), dgp.NonlinearFeedback(1)])
+def test_optima_that_run_worse_than_the_linear_model_are_left_out(monkeypatch, model):
+    given = [(-9.0, 0.6), (-7.0, 0.51), (-3.0, 0.4), (-1.0, 0.5)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found, used = chosen(monkeypatch, given, [], model=model)
+    assert found == [(-3.0, 0.4), (-1.0, 0.5)]
+    assert used == 1
+
+
+def test_there_is_another_set_of_starts_where_none_holds(monkeypatch):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found, used = chosen(monkeypatch, [(-9.0, 0.6)], [(-8.0, 0.45), (-8.5, 0.55)])
+    assert found == [(-8.0, 0.45)]
+    assert used == 2
+
+
+def test_a_warning_where_nothing_helps(monkeypatch):
+    with pytest.warns(UserWarning, match="no better than those of the linear model"):
+        found, used = chosen(monkeypatch, [(-8.0, 0.6)], [(-9.0, 0.7)])
+    assert found == [(-9.0, 0.7), (-8.0, 0.6)]
+    assert used == 2
+
+
+def test_a_model_without_functions_is_not_judged(monkeypatch):
+    model = dgp.Cascade(1, (dgp.Dynamic(), dgp.Dynamic()))
+    assert chosen(monkeypatch, [(-8.0, 0.6)], model=model) == ([(-8.0, 0.6)], 1)
+
+
+@pytest.mark.parametrize(
+    ("model", "with_noise", "pays"),
+    [
+        (dgp.Wiener(1), 1.24, True),
+        (dgp.Wiener(1), 1.26, False),
+        (dgp.NonlinearFeedback(1), 0.98, True),
+        (dgp.NonlinearFeedback(1), 1.0, False),
+    ],
+)
+def test_what_process_noise_may_cost(monkeypatch, model, with_noise, pays):
+    monkeypatch.setattr(free_runs, "free_run_error", lambda model, values, records: values)
+    assert noise_pays(model, [], optimum(0.0, with_noise), optimum(0.0, 1.0)) == pays
+
+
+def bent(n=240):
+    """A sensor that saturates, behind a lag."""
+    rng = np.random.default_rng(4)
+    u, x = np.repeat(rng.standard_normal(n // 3), 3), np.zeros(n)
+    for k in range(1, n):
+        x[k] = 0.85 * x[k - 1] + 0.4 * u[k - 1]
+    y = np.tanh(1.5 * x) + 0.03 * rng.standard_normal(n)
+    return dgp.Record(time=np.arange(float(n)), inputs=u, outputs=y)
+
+
+def test_a_fit_runs_better_than_the_linear_model():
+    record = bent()
+    options = {"method": "map", "restarts": 2, "workers": 1, "progress": False}
+    fits = (
+        dgp.fit(dgp.Wiener(1, pairs=1), record, steps=100, **options),
+        dgp.fit(dgp.LinearDynamicGP(1, pairs=1), record, **options),
+    )
+    errors = [free_run_error(f.model.collapsed, f.mode, f.model.prepare(record)) for f in fits]
+    assert errors[0] < 0.7 * errors[1]
 
 
 def test_without_process_noise_the_error_is_that_of_the_whole_run():
@@ -37,25 +127,3 @@ def test_with_process_noise_blocks_begin_at_the_state_of_the_filter():
     whole = process.components(samples=200, seed=0).mean.mean(0)
     error = np.sqrt(np.mean((record.outputs - whole) ** 2)) / float(model.scaling.output_scale[0])
     assert free_runs.free_run_error(model, values, model.prepare(record)) < 0.97 * error
-
-
-@pytest.mark.parametrize(("with_noise", "pays"), [(0.985, True), (0.995, False), (1.2, False)])
-def test_process_noise_has_to_better_free_runs_by_a_hundredth(monkeypatch, with_noise, pays):
-    model = dgp.NonlinearFeedback(1)
-    record = make_record()
-    model = model.scaled_to(record)
-    values = values_of(model, record, seed=3, linear=False)
-    noisy = Optimum(-1.0, values, np.zeros(1), "")
-    without = {k: v for k, v in values.items() if "noise_gain" not in k}
-    quiet = Optimum(5.0, without, np.zeros(1), "")
-
-    def error(model, at, records):
-        return with_noise if at is values else 1.0
-
-    monkeypatch.setattr(free_runs, "free_run_error", error)
-    prepared = model.prepare(record)
-    silent = free_runs.silenced(model, prepared, quiet, values)
-    assert free_runs.noise_pays(model, prepared, noisy, silent) == pays
-    left = silent.values["g_noise_gain_unit"] / values["g_noise_gain_unit"]
-    assert float(left.max()) == pytest.approx(free_runs.SILENT)
-    assert np.isfinite(silent.energy)

@@ -11,7 +11,6 @@ from scipy.linalg import expm
 from pyro_dynogp.lti.covariance import (
     autocovariance,
     output_row,
-    power_spectrum,
     real_covariance,
     state_covariance,
     state_output_covariance,
@@ -115,21 +114,6 @@ def spectrum(system):
         return transfer @ transfer.conj().T
 
     return G
-
-
-@pytest.mark.parametrize("noise", NOISES)
-@pytest.mark.parametrize("outputs", [None, 2])
-def test_power_spectrum(noise, outputs):
-    system = random_system(6, outputs=outputs, noise=noise)
-    omega = np.array([-20.0, -1.3, 0.0, 0.5, 3.0, 100.0])
-    expected = np.array([spectrum(system)(w) for w in omega])
-    ours = power_spectrum(system.modes, omega)
-    if outputs is None:
-        assert not ours.is_complex()
-        expected = expected[:, 0, 0].real
-    assert_close(ours, expected)
-    batch = power_spectrum(system.modes.expand((2,)), omega)
-    assert_close(batch[1], ours)
 
 
 def test_stationary_variance_by_simulation():

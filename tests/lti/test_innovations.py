@@ -8,13 +8,13 @@ import torch
 
 from pyro_dynogp.lti import innovation_layout, innovation_passes
 from pyro_dynogp.lti.covariance import state_covariance
-from pyro_dynogp.lti.dense import DenseCovariance
 from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.lti.innovation_layout import SEGMENT
 from pyro_dynogp.lti.innovations import innovations
 from pyro_dynogp.lti.lanes import WIDTH
 from pyro_dynogp.lti.modes import Modes
 from tests.lti import oracles
+from tests.lti.dense import DenseCovariance
 from tests.lti.oracles import assert_close, random_system, tensor
 
 EQUAL = 0.0625 * np.arange(400)

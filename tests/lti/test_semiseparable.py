@@ -7,13 +7,13 @@ import torch
 from hypothesis import given
 
 from pyro_dynogp.lti.covariance import jitter_variance, observability, state_covariance
-from pyro_dynogp.lti.dense import DenseCovariance
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.semiseparable import (
     NotPositiveDefiniteError,
     SemiseparableCovariance,
 )
 from tests.lti import oracles
+from tests.lti.dense import DenseCovariance
 from tests.lti.oracles import NOISES, assert_close, few, random_system, tensor
 
 
@@ -54,8 +54,6 @@ def test_every_method(seed, outputs, noise, known):
     agree(fast, dense, Y)
     root_diagonal = dense.root.diagonal().unsqueeze(-1)
     assert_close(fast.innovations(Y), root_diagonal * dense.root_solve(Y))
-    other = np.sort(np.concatenate([t[[0, 0, 7]], t[[3, 9]] + 0.011, [t[-1] + 1.5]]))
-    assert_close(fast.cross_matmul(other, Y), dense.cross_matmul(other, Y))
 
 
 def posterior_of_state(system, t, v, y, P0):
@@ -156,9 +154,6 @@ def test_batches(outputs):
             y = Y[..., 0]
             assert_close(together.final_state(y)[i, k], alone.final_state(y[i, k]))
             assert_close(together.final_covariance[i, k], alone.final_covariance)
-            other = np.array([t[0], t[3] + 0.01])
-            ours = together.cross_matmul(other, Y)[i, k]
-            assert_close(ours, alone.cross_matmul(other, Y[i, k]))
 
 
 @few
@@ -279,12 +274,3 @@ class TestErrors:
         modes = random_system(0).modes.without_process_noise()
         with pytest.raises(NotPositiveDefiniteError, match="row 0"):
             SemiseparableCovariance(modes, [0.0, 1.0], 0.0).log_determinant()
-
-    def test_other_times(self):
-        modes = random_system(0).modes
-        K = SemiseparableCovariance(modes, [0.0, 1.0], 0.1, torch.eye(6, dtype=torch.float64))
-        X = torch.zeros(2, 1, dtype=torch.float64)
-        with pytest.raises(ValueError, match=r"time.*from 0.0 on"):
-            K.cross_matmul([-1.0, 0.5], X)
-        with pytest.raises(ValueError, match=r"time.*decrease"):
-            K.cross_matmul([0.5, 0.2], X)

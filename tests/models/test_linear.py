@@ -88,7 +88,7 @@ def test_likelihood_is_in_the_units_of_the_record(record):
     """The observed site scores the raw outputs: absolute value against a dense normal."""
     from scipy.stats import multivariate_normal
 
-    from pyro_dynogp.lti.dense import signal_covariance
+    from tests.lti.dense import signal_covariance
 
     short = record[:40]
     model = dgp.LinearDynamicGP(inputs=1, pairs=2).scaled_to(record)

@@ -11,11 +11,11 @@ from scipy.stats import norm, t
 
 import pyro_dynogp as dgp
 from pyro_dynogp.layers.noise import Gaussian, StudentT, student_components
-from pyro_dynogp.lti.dense import signal_covariance
 from pyro_dynogp.moments.noise import noise_adjoint, noise_terms
 from pyro_dynogp.moments.problem import log_density
 from tests.conftest import simulate_record
 from tests.lti import oracles
+from tests.lti.dense import signal_covariance
 from tests.lti.oracles import tensor
 from tests.moments.problems import element, random_problem
 from tests.moments.wiener import Wiener

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 import pyro_dynogp as dgp
-from pyro_dynogp.lti.dense import signal_covariance
 from pyro_dynogp.lti.state import ModalState
+from tests.lti.dense import signal_covariance
 from tests.models.outputs import physical_of, prior_process
 
 

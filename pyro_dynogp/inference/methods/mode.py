@@ -6,13 +6,11 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import zip_longest
 from types import MappingProxyType
 from typing import get_args
 
 import numpy as np
 
-from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.density import WALL
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.free_runs import free_run_error, noise_pays, silenced
@@ -21,33 +19,28 @@ from pyro_dynogp.inference.optimise.gauss_newton import has_innovations
 from pyro_dynogp.inference.optimise.maximum import EFFORT, Effort, Optimizer, Optimum, maximise
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.run import Run
-from pyro_dynogp.inference.starts.plans import (
-    Values,
-    leading_layers,
-    linear_twin,
-    plans,
-    starting_point,
+from pyro_dynogp.inference.starts.linear import (
+    RANDOM,
+    linear_starts,
+    linear_twins,
+    optimizer_for,
+    spread,
 )
-from pyro_dynogp.inference.starts.poles import grown, starting_values
-from pyro_dynogp.inference.starts.subspace import subspace_starts
+from pyro_dynogp.inference.starts.plans import Values
+from pyro_dynogp.inference.starts.poles import grown
 from pyro_dynogp.layers.noise import TYPICAL
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.prepared import PreparedRecord, Records, as_measured
+from pyro_dynogp.models.prepared import Records, as_measured
 from pyro_dynogp.models.variants import without_noise_below_functions
-from pyro_dynogp.models.wiring import Dynamic
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
-from pyro_dynogp.support.parallel import seeded
 
 # Most iterations of linear fits by each optimizer.
 STEPS: Mapping[str, int] = MappingProxyType(
     {"gauss-newton": 100, "lbfgs": 500, "preconditioned": 500, "adam": 1500}
 )
-# Most starts of linear fits of each kind; iterations of those that come before cascades.
-RANDOM = 6
-LINEAR_STEPS = 40
-# Restarts of models with feedback. Sets of them, until one beats the linear model in free runs;
-# what is said where none does.
+# Restarts of models with feedback. Sets of restarts, until a model with functions beats the linear
+# one in free runs, and what is said where none does.
 LOOPED = 4
 ATTEMPTS = 2
 NO_BETTER = (
@@ -56,41 +49,6 @@ NO_BETTER = (
 )
 # Measurement noise, in sds of the outputs, from which starts without process noise climb at least.
 UNEXPLAINED = 0.5
-
-
-def starting_points(
-    model: Model,
-    records: Sequence[PreparedRecord],
-    run: Run,
-    *,
-    count: int,
-    steps: int,
-) -> list[Values]:
-    """Values of every site for each restart, from the optima of linear fits."""
-    scaling = records[0].scaling
-    optima: dict[str, Sequence[Values]] = {}
-    known: dict[Model, Sequence[Values]] = {}
-    for one in leading_layers(model):
-        assert isinstance(one.layer, Dynamic)
-        linear = linear_twin(model, one.layer, scaling)
-        if linear not in known:
-            training = tuple(records) if linear.outputs == model.outputs else _one_output(records)
-            twin = replace(linear, scaling=training[0].scaling)
-            found = maximise(
-                twin,
-                training,
-                linear_starts(twin, training, None, run.seed),
-                run,
-                optimizer=optimizer_for(twin),
-                steps=min(LINEAR_STEPS, steps),
-                key=f"linear-{one.name}",
-            )
-            known[linear] = [optimum.values for optimum in found]
-        optima[one.name] = known[linear]
-    with seeded(run.seed):  # what has no typical value is drawn
-        return [
-            starting_point(model, records, plan) for plan in plans(model, optima, count, run.seed)
-        ]
 
 
 def _louder(values: Values) -> Values:
@@ -104,13 +62,6 @@ def _louder(values: Values) -> Values:
         name: value.clamp_min(least[name]) if name in least else value
         for name, value in values.items()
     }
-
-
-def _one_output(records: Sequence[PreparedRecord]) -> tuple[PreparedRecord, ...]:
-    names = [records[0].record.output_names[0]]
-    selected = [each.record.select(outputs=names) for each in records]
-    scaling = Scaling.from_records(selected)
-    return tuple(PreparedRecord.of(record, scaling) for record in selected)
 
 
 @dataclass(frozen=True)
@@ -156,13 +107,6 @@ def check_optimizer(optimizer: Optimizer | None, model: Model | None = None) -> 
         raise invalid("optimizer", expected=f"{', '.join(most)} or {last}", got=repr(optimizer))
 
 
-def optimizer_for(model: Model) -> Optimizer:
-    """Gauss-Newton for Gaussian innovations, Adam for functions that do not feed back."""
-    if has_innovations(model):
-        return "gauss-newton"
-    return "adam" if model.has_function and not model.has_feedback else "lbfgs"
-
-
 def best_optima(
     problem: Problem, run: Run, optimizer: Optimizer | None, steps: int | None
 ) -> list[Optimum]:
@@ -197,47 +141,33 @@ def best_optima(
 def cascade_optima(problem: Problem, run: Run, optimizer: Optimizer, steps: int) -> list[Optimum]:
     """Optima of a model with static layers, best first.
 
-    A model with feedback whose free runs are no better than those of the linear model gets another
-    set of starts, and then a warning.
+    Those whose free runs through the training record are worse than those of the linear model are
+    left out. Where none remains there is another set of starts, and then a warning.
     """
-    model, records, learnt = problem.model, problem.records, problem.learnt
+    model, records, learnt = problem.target, problem.records, problem.learnt
     usual = LOOPED if model.has_feedback else 8 if model.has_function else RANDOM
     optima: list[Optimum] = []
     least = math.inf
-    for attempt in range(ATTEMPTS if model.has_feedback else 1):
+    for attempt in range(ATTEMPTS):
         again = replace(run, seed=run.seed + attempt)
-        starts = starting_points(
-            problem.target, records, again, count=run.restarts or usual, steps=steps
-        )
+        twins = linear_twins(model, records, again, steps)
+        starts = spread(model, records, twins, run.restarts or usual, again.seed)
         warm = [] if learnt is None else [grown(learnt, starts[0])]
         optima += climb(
-            problem.target, records, starts, warm, again, steps=steps, optimizer=optimizer,
-            prefix=f"again-{attempt}-" if attempt else "",
+            model, records, starts, warm, again, steps=steps, optimizer=optimizer,
+            prefix=f"again-{attempt}-" if attempt else "", judged=True,
         )  # fmt: skip
-        if not model.has_feedback:
+        lines = [twin for twin in twins.values() if twin[0].outputs == model.outputs]
+        if not model.has_function or not lines:
             return optima
         optima.sort(key=lambda one: one.energy)
-        # Nothing comes back in a start: it is the linear model.
-        least = min(least, *(free_run_error(problem.target, one, records) for one in starts))
-        if free_run_error(problem.target, optima[0].values, records) < least:
-            return optima
+        errors = [free_run_error(twin, values[0], own) for twin, own, values in lines]
+        least = min(least, *errors)
+        holding = [one for one in optima if free_run_error(model, one.values, records) <= least]
+        if holding:
+            return holding
     warnings.warn(NO_BETTER, stacklevel=2)
     return optima
-
-
-def linear_starts(
-    model: Model, records: Sequence[PreparedRecord], count: int | None, seed: int
-) -> list[Values]:
-    """Starts of a linear model: of subspace identification and with random poles, in turn.
-
-    Args:
-        model: the model. records: to which it is fitted. seed: of random poles.
-        count: how many; None for `RANDOM` of each kind, as far as there are orders.
-    """
-    subspace = subspace_starts(model, records, seed)[:RANDOM]
-    random = starting_values(model, records, count=count or RANDOM, seed=seed)
-    both = [one for pair in zip_longest(subspace, random) for one in pair if one is not None]
-    return both[:count]
 
 
 def at_optimum(model: Model, optima: Sequence[Optimum], seed: int, records: Records) -> Fitted:
@@ -267,13 +197,14 @@ def climb(
     optimizer: Optimizer,
     effort: Effort = EFFORT,
     prefix: str = "",
+    judged: bool = False,
 ) -> list[Optimum]:
     """Optima of the collapsed model from fresh starts and from what is learnt, best first.
 
     Where static layers see process noise fresh starts take half of the steps without any, which
     needs no filter, and the better half of them takes the other half with it. Such noise can
     explain all that dynamics and functions should: from a poor start to a high density and poor
-    forecasts. With feedback the noise stays only where free runs are better with it.
+    forecasts. With feedback, or where it is `judged`, it stays only where it pays (`noise_pays`).
 
     Args:
         model: collapsed. records: of it. starts, learnt: values of all sites. run: how.
@@ -297,7 +228,7 @@ def climb(
     elif model.has_feedback:
         starts = [_louder(start) for start in starts]
     optima = optima_of(model, [*learnt, *starts], f"{prefix}cascade")
-    if not model.has_feedback or not better:
+    if not better or not (model.has_feedback or judged):
         return optima
     prepared = model.prepare(records)
     silent = [silenced(model, prepared, one, starts[0]) for one in better]

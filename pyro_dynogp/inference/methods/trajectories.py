@@ -15,7 +15,6 @@ from torch import Tensor
 
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.methods.base import Problem
-from pyro_dynogp.inference.methods.mode import starting_points
 from pyro_dynogp.inference.methods.svi import Schedule, Trained, train
 from pyro_dynogp.inference.methods.trajectory_guide import (
     GuideChoice,
@@ -26,6 +25,7 @@ from pyro_dynogp.inference.methods.trajectory_guide import (
 )
 from pyro_dynogp.inference.posteriors import Sampled
 from pyro_dynogp.inference.run import Run
+from pyro_dynogp.inference.starts.linear import starting_points
 from pyro_dynogp.layers.sites import Arguments, Program
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord

@@ -87,7 +87,7 @@ class Innovations:
         self._there = [~torch.isnan(y) for y in self.density.observations]
         ((_, layer),) = self.density.model.dynamic
         samples = sum(y.numel() for y in self.density.observations)
-        self.width = max(1, KEPT // (samples * (2 * layer.pairs + 4)))
+        self.width = max(1, KEPT // (samples * (2 * layer.modes + 4)))
 
     def energies(self, z: np.ndarray) -> np.ndarray:
         """Energies (k,) at z (k, d); infinite where there is none."""

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.data.scaling import Scaling
-from pyro_dynogp.inference.starts.poles import random_poles
+from pyro_dynogp.inference.starts.poles import WALKS, random_poles
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.models.priors import TimeScale
@@ -18,6 +18,8 @@ from pyro_dynogp.models.wiring import Dynamic, Known, Wire
 Values = dict[str, Tensor]
 # Size of gains that are there to be learnt.
 SMALL = 0.05
+# Sites of integrators, a row for each output.
+INTEGRATORS = ("integrator_gain", "integrator_drift", "integrator_noise")
 
 
 class DynamicStart:
@@ -55,6 +57,10 @@ class DynamicStart:
             none = torch.zeros(layer.pairs, 0, 2, dtype=torch.float64)
             gain = values.get(self._key("input_gain"), none)
             values[self._key("input_gain")] = self._fed_back(gain)
+            if self._key("integrator_gain") in values:
+                nothing = torch.zeros(len(values[self._key("integrator_gain")]), self.one.fed)
+                levels = [values[self._key("integrator_gain")], nothing.double()]
+                values[self._key("integrator_gain")] = torch.cat(levels, 1)
         if layer.outputs > 1 and self._key("output_gain") not in values:
             # One signal is the linear fit; the others see the same modes with other gains.
             P = layer.pairs
@@ -69,12 +75,17 @@ class DynamicStart:
                 D = values[self._key("feedthrough")]
                 rest = self._random(layer.outputs - 1, D.shape[-1], scale=0.1)
                 values[self._key("feedthrough")] = torch.cat([D.reshape(1, -1), rest])
+            for site in map(self._key, INTEGRATORS):
+                if site in values:
+                    rest = self._random(layer.outputs - 1, *values[site].shape[1:])
+                    values[site] = torch.cat([values[site], rest])
             if layer.process_noise:
                 values.update(self._small_noise())
         if layer.process_noise and self._key("noise_gain_unit") not in values:
             values.update(self._small_noise())
         if not layer.process_noise:
-            values = {k: v for k, v in values.items() if "_noise_gain" not in k}
+            noise = ("_noise_gain", "_integrator_noise")
+            values = {k: v for k, v in values.items() if not any(part in k for part in noise)}
         return values
 
     def _fed_back(self, gain: Tensor) -> Tensor:
@@ -118,7 +129,9 @@ class DynamicStart:
     def _small_noise(self) -> Values:
         layer = self.layer
         count = layer.brownian or layer.outputs
+        walk = {self._key("integrator_noise"): torch.full((layer.outputs, count), WALKS).double()}
         return {
+            **(walk if layer.integrators else {}),
             self._key("noise_gain_local_scale"): torch.full((layer.pairs,), 0.5).double(),
             self._key("noise_gain_unit"): self._random(layer.pairs, count, 2, scale=0.3).abs()
             + 0.05,
@@ -134,6 +147,6 @@ class DynamicStart:
 
     def scale(self, values: Values, factor: float) -> None:
         """Multiply the layer's output."""
-        for name in ("input_gain", "feedthrough", "noise_gain_unit"):
+        for name in ("input_gain", "feedthrough", "noise_gain_unit", *INTEGRATORS):
             if self._key(name) in values:
                 values[self._key(name)] = values[self._key(name)] * factor

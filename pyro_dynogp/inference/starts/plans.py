@@ -31,6 +31,7 @@ def linear_twin(model: Model, layer: Dynamic, scaling: Scaling) -> Model:
         direct=model.direct,
         outputs=layer.outputs if layer.outputs == model.outputs else 1,
         pairs=layer.pairs,
+        integrators=layer.integrators,
         noise=layer.noise,
         brownian=layer.brownian,
         feedthrough=layer.feedthrough,
@@ -168,7 +169,7 @@ def starting_point(model: Model, records: Sequence[PreparedRecord], plan: Plan) 
         suffix = "" if len(records) == 1 else f"_{index}"
         for one in model.state_sites:
             assert isinstance(one.layer, Dynamic)
-            state = torch.zeros(2 * one.layer.pairs, dtype=torch.float64)
+            state = torch.zeros(2 * one.layer.modes, dtype=torch.float64)
             if one.name == plan.leading and plan.linear is not None:
                 state = _linear_state(model, one, record, plan.linear)
             values[f"{one.name}_initial_state{suffix}"] = state
@@ -199,7 +200,7 @@ def _linear_state(
     layer = one.layer
     assert isinstance(layer, Dynamic)
     if layer.outputs != model.outputs or not one.channels:
-        return torch.zeros(2 * layer.pairs, dtype=torch.float64)
+        return torch.zeros(2 * layer.modes, dtype=torch.float64)
     noisy = "g_noise_gain_unit" in linear
     alone = (replace(layer, feedback=(), process_noise=noisy),)
     twin = Model(

@@ -21,6 +21,9 @@ from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.models.priors import TimeScale, numerators
 
+# How far the random walk beside an integrator gets at a start, see `ModesPrior`.
+WALKS = 0.1
+
 
 def starting_values(
     model: Model, records: Sequence[PreparedRecord], *, count: int, seed: int, tries: int = 48
@@ -90,11 +93,16 @@ def values_given_poles(
     ((wire, layer),) = model.dynamic
     g = wire.name
     P, n_u, n_y = layer.pairs, model.inputs - model.direct, model.outputs
+    unit_rate = TimeScale.of(scaling).typical_rate
     designs, targets = [], []
     for record in records:
         u = record.scaled_inputs.numpy()
-        dynamic = _design(poles, record.grid, u[:, :n_u], layer.feedthrough)
-        designs.append(np.concatenate([u[:, n_u:], dynamic], axis=1))
+        parts = [u[:, n_u:], *_design(poles, record.grid, u[:, :n_u])]
+        if layer.integrators:
+            parts.append(unit_rate * _levels(record.grid, u[:, :n_u]))
+        if layer.feedthrough:
+            parts.append(u[:, :n_u])
+        designs.append(np.concatenate([*parts, np.ones((len(u), 1))], axis=1))
         targets.append(record.scaled_outputs.numpy())
     X, Y = np.concatenate(designs), np.concatenate(targets)
     weights = np.stack([_ridge(X, Y[:, a]) for a in range(n_y)])  # n_y, columns
@@ -104,7 +112,6 @@ def values_given_poles(
     rate = np.abs(poles)
     gains = weights[:, : 2 * P * n_u].reshape(n_y, P, n_u, 2)
     residues = (gains[..., 0] + 1j * gains[..., 1]) * rate[:, None]  # c_aj B_jm
-    unit_rate = TimeScale.of(scaling).typical_rate
     values: dict[str, Any] = {
         f"{g}_log_decay": np.log(-poles.real / unit_rate),
         f"{g}_log_frequency": np.log(poles.imag / unit_rate),
@@ -128,13 +135,17 @@ def values_given_poles(
                 turn = np.exp(-1j * np.angle(left[0, 0]))
                 direction[:, j], B[j] = left[:, 0] * turn, size[0] * right[0] / turn
         values[f"{g}_output_gain"] = np.stack([direction.real, direction.imag], -1)
+    if layer.integrators:
+        first = 2 * P * n_u
+        values[f"{g}_integrator_gain"] = weights[:, first : first + n_u]
+        values[f"{g}_integrator_drift"] = weights[:, first + n_u]
     if n_u:
         # From residues to sections: b1 = g1 |lambda|, b0 = g0 |lambda|^2.
         section = numerators(torch.as_tensor(poles), torch.as_tensor(B)).numpy()
         section = section / np.stack([rate, rate**2], -1)[:, None, :]
         values[f"{g}_input_gain"] = np.clip(section, -10.0, 10.0)
         if layer.feedthrough:
-            D = weights[:, 2 * P * n_u : -1]
+            D = weights[:, -1 - n_u : -1]
             values[f"{g}_feedthrough"] = D if model.several_outputs else D[0]
     if layer.process_noise:
         brownian = layer.brownian or n_y
@@ -142,6 +153,8 @@ def values_given_poles(
         values[f"{g}_noise_gain_local_scale"] = np.full(P, math.sqrt(share / HORSESHOE_SCALE))
         unit = np.full((P, brownian, 2), math.sqrt(0.5 * share / HORSESHOE_SCALE))
         values[f"{g}_noise_gain_unit"] = unit
+        if layer.integrators:
+            values[f"{g}_integrator_noise"] = np.full((n_y, brownian), WALKS)
     tensors = {name: torch.tensor(value, dtype=torch.float64) for name, value in values.items()}
     for site in model.all_sites(scaling, len(records)):
         if site.name not in tensors:
@@ -149,22 +162,22 @@ def values_given_poles(
     return float(np.nanmean(residual**2)), tensors
 
 
-def _design(poles: np.ndarray, grid: TimeGrid, u: np.ndarray, feedthrough: bool) -> np.ndarray:
-    """Regressors (n, 2 P n_u + n_u + 1): y = 2 Re sum B/|lambda| x + D u + offset."""
+def _design(poles: np.ndarray, grid: TimeGrid, u: np.ndarray) -> list[np.ndarray]:
+    """Regressors (n, 2 P n_u) of 2 Re sum B/|lambda| x; none without inputs."""
     n, n_u = u.shape
-    columns = []
-    if n_u:
-        one = torch.ones(len(poles), dtype=torch.complex128)
-        modes = Modes(torch.as_tensor(poles), one.unsqueeze(-1), one)
-        states = np.stack(
-            [held_states(modes, grid, u[:, m : m + 1]) for m in range(n_u)], -1
-        )  # n, P, n_u
-        states = 2.0 * states * np.abs(poles)[:, None]
-        columns.append(np.stack([states.real, -states.imag], -1).reshape(n, -1))
-        if feedthrough:
-            columns.append(u)
-    columns.append(np.ones((n, 1)))
-    return np.concatenate(columns, axis=1)
+    if not n_u:
+        return []
+    one = torch.ones(len(poles), dtype=torch.complex128)
+    modes = Modes(torch.as_tensor(poles), one.unsqueeze(-1), one)
+    states = np.stack([held_states(modes, grid, u[:, m : m + 1]) for m in range(n_u)], -1)
+    states = 2.0 * states * np.abs(poles)[:, None]  # n, P, n_u
+    return [np.stack([states.real, -states.imag], -1).reshape(n, -1)]
+
+
+def _levels(grid: TimeGrid, u: np.ndarray) -> np.ndarray:
+    """Integrals (n, n_u + 1) of held inputs, and time."""
+    held = np.diff(grid.time.numpy())[:, None] * np.insert(u, u.shape[1], 1.0, axis=1)[:-1]
+    return np.concatenate([np.zeros((1, held.shape[1])), np.cumsum(held, axis=0)])
 
 
 def _ridge(X: np.ndarray, y: np.ndarray, strength: float = 1e-4) -> np.ndarray:

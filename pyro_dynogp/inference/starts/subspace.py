@@ -46,7 +46,8 @@ def subspace_starts(
     generator = np.random.default_rng(seed)
     sites = model.all_sites(scaling, len(records))
     found: list[tuple[float, dict[str, Tensor]]] = []
-    for poles in subspace_poles(records, layer.pairs, model.inputs - model.direct):
+    inputs, levels = model.inputs - model.direct, layer.integrators * layer.outputs
+    for poles in subspace_poles(records, layer.pairs, inputs, levels):
         small = replace(model, layers=(replace(layer, pairs=len(poles), name=wire.name),))
         misfit, values = values_given_poles(small, records, scaling, poles)
         if len(poles) < layer.pairs:
@@ -58,11 +59,14 @@ def subspace_starts(
     return [values for _, values in found]
 
 
-def subspace_poles(records: Sequence[PreparedRecord], pairs: int, inputs: int) -> list[np.ndarray]:
+def subspace_poles(
+    records: Sequence[PreparedRecord], pairs: int, inputs: int, integrators: int = 0
+) -> list[np.ndarray]:
     """Poles (p,) [1/time unit] of models of 1 to `pairs` conjugate pairs, as `subspace_starts`.
 
     Args:
         records: training records. pairs: most. inputs: the first so many have dynamics.
+        integrators: poles beside them; so many that are nearest to zero are left out.
     """
     scaling = records[0].scaling
     steps = [np.diff(each.record.time) for each in records if len(each) > 1]
@@ -91,10 +95,13 @@ def subspace_poles(records: Sequence[PreparedRecord], pairs: int, inputs: int) -
     left, size, _ = np.linalg.svd(R[half:start, start:].T, full_matrices=False)
     found = []
     for p in range(1, pairs + 1):
-        observability = left[:, : 2 * p] * np.sqrt(size[: 2 * p])
+        order = 2 * p + integrators
+        observability = left[:, :order] * np.sqrt(size[:order])
         upper, lower = observability[:-outputs], observability[outputs:]
         state = np.linalg.lstsq(upper, lower, rcond=None)[0]
-        found.append(_pairs(np.linalg.eigvals(state), scaling)[:pairs])
+        values = np.linalg.eigvals(state)
+        values = values[np.argsort(np.abs(values - 1.0))[integrators:]] if integrators else values
+        found.append(_pairs(values, scaling)[:pairs])
     return found
 
 

@@ -1,7 +1,4 @@
-"""The dense twin of the semiseparable algebra: same interface, O(n^3), plain torch.
-
-It is the oracle of the tests and the path for small problems on an accelerator.
-"""
+"""The dense twin of the semiseparable algebra: same interface, O(n^3), plain torch."""
 
 from __future__ import annotations
 
@@ -117,10 +114,6 @@ class DenseCovariance:
     def matmul(self, X: Tensor) -> Tensor:
         """K X."""
         return self.matrix @ X
-
-    def cross_matmul(self, time: Numbers | TimeGrid, X: Tensor) -> Tensor:
-        """S(T*, T) X for other times T*."""
-        return signal_covariance(self.modes, time, self.grid, self.initial_covariance) @ X
 
     def inverse_diagonal(self) -> Tensor:
         """Diagonal of K^{-1}; zero in missing rows."""

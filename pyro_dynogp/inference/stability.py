@@ -1,0 +1,64 @@
+"""Poles that a record cannot hold: slower than it is long, or of an unstable plant."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.statistics.growth import growth
+
+# A pole is slow where the record holds fewer of its time constants than this. The prior of decay
+# rates (`LogDecayRate`) has its mode at twenty, and below three keeps it from going lower by nearly
+# three nats for each factor e: only a record that pulls towards zero gets there.
+FEWEST = 3.0
+
+
+def warnings_of(fit: Fitted) -> tuple[str, ...]:
+    """What is to be said of the poles of a fit: nothing where all is well."""
+    return tuple(_unstable(fit) or _slow(fit))
+
+
+def _slow(fit: Fitted) -> list[str]:
+    """Of the slowest pole of each dynamic layer."""
+    unit, duration = fit.scaling.time_unit, float(fit.scaling.duration)
+    found = []
+    system = fit.system_at(fit.mode)
+    for (wire, layer), (_, made) in zip(system.dynamic, fit.model.dynamic, strict=True):
+        pairs = layer.modes.poles[: made.pairs].tolist()
+        pole = max(pairs, key=lambda pole: pole.real)
+        held = -pole.real * duration
+        if held < FEWEST:
+            lasts = abs(pole.imag) > 2.0 * abs(pole.real)
+            found.append(
+                f"layer {wire.name}: the pole with natural frequency {abs(pole):.4g} rad/{unit} "
+                f"decays so slowly that the record holds only {held:.1f} of its time constants. "
+                f"Within this record it {'goes on oscillating' if lasts else 'all but integrates'}"
+                ", and forecasts with it are not to be trusted. "
+                + (
+                    "Add a Sinusoid channel if something outside oscillates, "
+                    if lasts
+                    else "Set integrators=1 if the plant integrates, remove what drifts beside it, "
+                )
+                + "take a longer record, or fewer pairs."
+            )
+    return found
+
+
+def _unstable(fit: Fitted) -> list[str]:
+    """Of outputs whose past says that they grow."""
+    step, unit = float(fit.scaling.time_step), fit.scaling.time_unit
+    records = [record for record in fit.records if len(record) > 1]
+    if any(np.ptp(np.diff(r.time)) > 1e-6 * step or r.sampling_time > 1.5 * step for r in records):
+        return []
+    found = []
+    for index, name in enumerate(fit.scaling.output_names):
+        grows = growth([r.inputs for r in records], [r.outputs[:, index] for r in records])
+        if grows is not None and grows.unstable:
+            rate, error = grows.rate / step, grows.error / step
+            found.append(
+                f"output {name!r}: the record is that of an unstable plant (an autoregression has "
+                f"a pole at {rate:.3g} +- {error:.1g} 1/{unit}), and only stable systems can be "
+                "identified. Identify the closed loop, which is stable: take its reference as the "
+                "input."
+            )
+    return found
