@@ -20,6 +20,7 @@ from tests.benchmarks import (
     electricity,
     example2,
     filter,
+    first_use,
     fits,
     guides,
     loop_cost,
@@ -36,6 +37,7 @@ from tests.benchmarks.paper import run as paper
 
 PARTS = {
     "speed": speed.run,
+    "first_use": first_use.run,
     "fits": fits.run,
     "example2": example2.run,
     "wiener": wiener.run,
