@@ -193,35 +193,33 @@ def test_beyond_its_range_it_keeps_its_value():
 
 
 WRONG = [
-    (dict(function="tanh"), "a function of torch"),
-    (dict(function=lambda y: 0.0 * y + 1.0), "changes over the range"),
-    (dict(function=lambda y: (y - 100.0).sqrt()), "finite"),
-    (dict(function=lambda y: y.float()), "float64"),
-    (dict(function=lambda y: y[..., :3]), "values of shape"),
-    (dict(function=lambda y: y, range=(1.0, 1.0)), "low < high"),
-    (dict(function=lambda y, a: a * y, parameters={"a": 1.0}), "distribution of pyro"),
-    (
-        dict(function=lambda y, a: y, parameters={"a": dist.Normal(torch.zeros(2), 1.0)}),
-        "one number",
-    ),
+    ({"function": "tanh"}, "a function of torch"),
+    ({"function": lambda y: 0.0 * y + 1.0}, "changes over the range"),
+    ({"function": lambda y: (y - 100.0).sqrt()}, "finite"),
+    ({"function": lambda y: y.float()}, "float64"),
+    ({"function": lambda y: y[..., :3]}, "values of shape"),
+    ({"function": lambda y: y, "range": (1.0, 1.0)}, "low < high"),
+    ({"function": lambda y, a: a * y, "parameters": {"a": 1.0}}, "distribution of pyro"),
+    ({"function": tanh, "parameters": {"width": dist.Normal(torch.zeros(2), 1.0)}}, "one number"),
 ]
+
+
+def run(options):
+    layers = (Dynamic(feedback=("f",)), Known(**options))
+    record = make_record()
+    model = dgp.Cascade(1, layers, output="g").scaled_to(record)
+    return log_prob(model, values_at(model, 0), record)
 
 
 @pytest.mark.parametrize(("options", "message"), WRONG)
 def test_what_is_wrong_is_named(options, message):
-    record = make_record()
     with pytest.raises(ValueError, match=message):
-        layers = (Dynamic(feedback=("f",)), Known(**options))
-        model = dgp.Cascade(1, layers, output="g").scaled_to(record)
-        log_prob(model, values_at(model, 0), record)
+        run(options)
 
 
 def test_several_signals_of_a_trajectory_are_refused():
-    record = make_record()
-    layers = (Dynamic(feedback=("f",)), Known(lambda y, u: y * u, skip=("inputs",)))
-    model = dgp.Cascade(1, layers, output="g").scaled_to(record)
     with pytest.raises(ValueError, match="one signal"):
-        log_prob(model, values_at(model, 0), record)
+        run({"function": lambda y, u: y * u, "skip": ("inputs",)})
 
 
 def test_priors_are_of_double_precision():
