@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import torch
 
@@ -48,6 +50,15 @@ def values_of(model, record, seed=0, linear=True):
 def system_at(model, values):
     states = {w.name: values[f"{w.name}_initial_state"] for w in model.state_sites}
     return model.begin(model.system(values, model.scaling), states)
+
+
+def plain_loop(model, system, record, slope=0.0, constant=0.0):
+    """The loop in numpy, with another function in the place of the known one."""
+    slope, constant = (torch.tensor(x, dtype=torch.float64) for x in ([[slope]], [constant]))
+    line = SimpleNamespace(slope=slope, constant=constant)
+    parts = {"g": system.layer("g"), "f": SimpleNamespace(function=line)}
+    plain = SimpleNamespace(layer=parts.get, offset=system.offset, noise=system.noise)
+    return ClosedLoop(model, plain, record)
 
 
 class ClosedLoop:

@@ -1,7 +1,6 @@
 """Layers whose function the user writes, against linear systems and plain simulations."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pyro
@@ -16,7 +15,7 @@ from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.layers.sites import sample
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.wiring import Dynamic, Known
-from tests.models.closed_loops import ClosedLoop, make_record, system_at
+from tests.models.closed_loops import make_record, plain_loop, system_at
 
 
 def looped(function, parameters, record=None, **options):
@@ -44,15 +43,6 @@ def values_at(model, seed):
 def log_prob(model, values, record):
     (prepared,) = model.prepare(record)
     return output_process(system_at(model, values), prepared).log_prob(prepared.observations)
-
-
-def plain_loop(model, system, record, slope=0.0, constant=0.0):
-    """The loop in numpy, with another function in the place of the known one."""
-    slope, constant = (torch.tensor(x, dtype=torch.float64) for x in ([[slope]], [constant]))
-    line = SimpleNamespace(slope=slope, constant=constant)
-    parts = {"g": system.layer("g"), "f": SimpleNamespace(function=line)}
-    plain = SimpleNamespace(layer=parts.get, offset=system.offset, noise=system.noise)
-    return ClosedLoop(model, plain, record)
 
 
 @pytest.mark.parametrize("seed", range(3))

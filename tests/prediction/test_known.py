@@ -8,7 +8,7 @@ from scipy.stats import ks_2samp
 
 import pyro_dynogp as dgp
 from pyro_dynogp.models.outputs import output_process
-from tests.models.test_known import plain_loop, system_at
+from tests.models.closed_loops import plain_loop, system_at
 
 STEP, WIDTH = 0.05, 0.1
 
