@@ -54,6 +54,7 @@ if TYPE_CHECKING:  # the same names, for editors and type checkers; a test compa
     from pyro_dynogp.models.architectures import HammersteinWiener as HammersteinWiener
     from pyro_dynogp.models.architectures import LinearDynamicGP as LinearDynamicGP
     from pyro_dynogp.models.architectures import NonlinearFeedback as NonlinearFeedback
+    from pyro_dynogp.models.architectures import ParallelWienerHammerstein as ParallelWienerHammerstein
     from pyro_dynogp.models.architectures import Wiener as Wiener
     from pyro_dynogp.models.architectures import WienerHammerstein as WienerHammerstein
     from pyro_dynogp.models.model import Model as Model
@@ -90,6 +91,7 @@ HOMES = {
     "WienerHammerstein": "models.architectures",
     "HammersteinWiener": "models.architectures",
     "NonlinearFeedback": "models.architectures",
+    "ParallelWienerHammerstein": "models.architectures",
     "Cascade": "models.architectures",
     "Model": "models.model",
     "Dynamic": "models.wiring",
