@@ -54,7 +54,9 @@ if TYPE_CHECKING:  # the same names, for editors and type checkers; a test compa
     from pyro_dynogp.models.architectures import HammersteinWiener as HammersteinWiener
     from pyro_dynogp.models.architectures import LinearDynamicGP as LinearDynamicGP
     from pyro_dynogp.models.architectures import NonlinearFeedback as NonlinearFeedback
-    from pyro_dynogp.models.architectures import ParallelWienerHammerstein as ParallelWienerHammerstein
+    from pyro_dynogp.models.architectures import (
+        ParallelWienerHammerstein as ParallelWienerHammerstein,
+    )
     from pyro_dynogp.models.architectures import Wiener as Wiener
     from pyro_dynogp.models.architectures import WienerHammerstein as WienerHammerstein
     from pyro_dynogp.models.model import Model as Model

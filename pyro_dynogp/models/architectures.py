@@ -168,7 +168,7 @@ def ParallelWienerHammerstein(
     likelihood: Likelihood | None = None,
     **options: Unpack[ModelOptions],
 ) -> Model:
-    """Branches side by side, dynamics g1 and a nonlinearity f1 of it, g2 and f2, ...; then dynamics.
+    """Branches side by side, dynamics g1 and a function f1 of it, g2 and f2, ...; then dynamics.
 
     The last dynamics see all branches, each with gains of its own: with enough pairs they are the
     sum of different dynamics for each branch.
