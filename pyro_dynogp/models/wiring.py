@@ -155,11 +155,12 @@ def _check_sources(name: str, layer: Layer, width: Mapping[str, int], before: st
     option = "sees" if layer.sees else "skip"
     named = layer.sees or layer.skip
     expected = set(width) if layer.sees else set(width) - {before}
-    if not set(named) <= expected or len(set(named)) < len(named) or isinstance(named, str):
+    repeated = isinstance(named, str) or len(set(named)) < len(named)
+    for signal in [named] if repeated else [n for n in named if n not in expected]:
         raise invalid(
             f"{option} of layer {name!r}",
-            expected=f"a tuple of names of earlier signals, of {sorted(expected)}",
-            got=repr(named),
+            expected=f"names of earlier signals, a tuple of {sorted(expected)}",
+            got=repr(signal),
         )
     if layer.sees and layer.skip:
         raise invalid(f"layer {name!r}", expected="sees or skip", got="both")

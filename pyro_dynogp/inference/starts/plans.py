@@ -100,7 +100,7 @@ def plans(
 def starting_point(model: Model, records: Sequence[PreparedRecord], plan: Plan) -> Values:
     """Values of every site of a cascade, layer by layer along the mean trajectories.
 
-    The leading layer is the linear fit, a layer beside it has the same modes, moved at random, other
+    The leading layer is the linear fit, a layer beside it has its modes, moved at random, other
     dynamic layers pass their input on with small random dynamics beside it, and static layers start
     as the identity on the range of their input: the cascade starts as the linear model, whose
     offset and noise it takes over. From static layers in feedback nothing comes back at first.
