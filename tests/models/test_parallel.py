@@ -6,6 +6,7 @@ import torch
 from gpytorch.kernels import RQKernel
 
 import pyro_dynogp as dgp
+from pyro_dynogp.inference.starts.plans import Plan, starting_point
 from pyro_dynogp.layers.sites import sample
 from pyro_dynogp.models.outputs import output_process
 from tests.models.closed_loops import make_record, system_at
@@ -86,3 +87,19 @@ def test_a_branch_that_leads_nowhere_is_refused():
     layers = (dgp.Dynamic(), dgp.Static(), dgp.Dynamic(sees=("inputs",)))
     with pytest.raises(ValueError, match="without effect"):
         _ = dgp.Cascade(1, layers)
+
+
+def test_a_layer_beside_the_leading_one_starts_with_its_modes_moved():
+    record = make_record()
+    model, _ = parallel(record)
+    twin = dgp.LinearDynamicGP(1, pairs=1).scaled_to(record)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        linear = sample(twin.all_sites(twin.scaling, 1))
+    values = starting_point(model, model.prepare(record), Plan("g1", linear, False, 0))
+    torch.testing.assert_close(values["g1_log_decay"], linear["g_log_decay"])
+    moved = (values["g2_log_decay"] - linear["g_log_decay"]).abs()
+    assert 0.0 < float(moved) < 2.0
+    ratio = values["g2_input_gain"] / values["g1_input_gain"]
+    torch.testing.assert_close(ratio, ratio[0, 0, 0].expand(ratio.shape))
+    assert values["g3_log_decay"].shape == (4,)
