@@ -54,14 +54,17 @@ if TYPE_CHECKING:  # the same names, for editors and type checkers; a test compa
     from pyro_dynogp.models.architectures import HammersteinWiener as HammersteinWiener
     from pyro_dynogp.models.architectures import LinearDynamicGP as LinearDynamicGP
     from pyro_dynogp.models.architectures import NonlinearFeedback as NonlinearFeedback
+    from pyro_dynogp.models.architectures import (
+        ParallelWienerHammerstein as ParallelWienerHammerstein,
+    )
     from pyro_dynogp.models.architectures import Wiener as Wiener
     from pyro_dynogp.models.architectures import WienerHammerstein as WienerHammerstein
+    from pyro_dynogp.models.layer import Dynamic as Dynamic
+    from pyro_dynogp.models.layer import Known as Known
+    from pyro_dynogp.models.layer import Static as Static
     from pyro_dynogp.models.model import Model as Model
     from pyro_dynogp.models.priors import TimeScale as TimeScale
     from pyro_dynogp.models.priors import sample_modes as sample_modes
-    from pyro_dynogp.models.wiring import Dynamic as Dynamic
-    from pyro_dynogp.models.wiring import Known as Known
-    from pyro_dynogp.models.wiring import Static as Static
     from pyro_dynogp.prediction.prediction import Prediction as Prediction
     from pyro_dynogp.prediction.scores import scores as scores
     from pyro_dynogp.report.loop import close_loop as close_loop
@@ -90,11 +93,12 @@ HOMES = {
     "WienerHammerstein": "models.architectures",
     "HammersteinWiener": "models.architectures",
     "NonlinearFeedback": "models.architectures",
+    "ParallelWienerHammerstein": "models.architectures",
     "Cascade": "models.architectures",
     "Model": "models.model",
-    "Dynamic": "models.wiring",
-    "Known": "models.wiring",
-    "Static": "models.wiring",
+    "Dynamic": "models.layer",
+    "Known": "models.layer",
+    "Static": "models.layer",
     "Gaussian": "layers.noise",
     "StudentT": "layers.noise",
     "Heteroscedastic": "layers.noise",

@@ -160,6 +160,43 @@ def WienerHammerstein(
     return Model(inputs, layers, likelihood or Gaussian(), **options)
 
 
+def ParallelWienerHammerstein(
+    inputs: int,
+    *,
+    branches: int = 2,
+    outputs: int = 1,
+    pairs: int | tuple[int, int] = 2,
+    inducing: int = 32,
+    kernel: Kernel | None = None,
+    process_noise: bool | tuple[bool, bool] = True,
+    likelihood: Likelihood | None = None,
+    **options: Unpack[ModelOptions],
+) -> Model:
+    """Branches side by side, dynamics g1 and a function f1 of it, g2 and f2, ...; then dynamics.
+
+    The last dynamics see all branches, each with gains of its own: with enough pairs they are the
+    sum of different dynamics for each branch.
+
+    Args: as those of `WienerHammerstein`; branches is their number, pairs those of each first layer
+        and of the last one, which has `branches` times as many.
+
+    Example:
+        >>> [wire.sources for wire in ParallelWienerHammerstein(1).wires]
+        [('inputs',), ('g1',), ('inputs',), ('g2',), ('f1', 'f2')]
+    """
+    first, second = pairs if isinstance(pairs, tuple) else (pairs, pairs)
+    noise = process_noise if isinstance(process_noise, tuple) else (process_noise,) * 2
+    layers: list[Layer] = []
+    for _ in range(branches):
+        layers.append(Dynamic(pairs=first, process_noise=noise[0], sees=("inputs",)))
+        layers.append(Static(inducing=inducing, kernel=kernel))
+    seen = tuple(f"f{branch + 1}" for branch in range(branches)) if branches > 1 else ("f",)
+    layers.append(
+        Dynamic(outputs=outputs, pairs=branches * second, process_noise=noise[1], sees=seen)
+    )
+    return Model(inputs, tuple(layers), likelihood or Gaussian(), **options)
+
+
 def NonlinearFeedback(
     inputs: int,
     *,

@@ -2,132 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
-from typing import ClassVar, Literal
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
-import pyro.distributions as dist
-from gpytorch.kernels import Kernel
-from torch import Tensor
-
-from pyro_dynogp.lti.modes import NoiseStructure
-from pyro_dynogp.support.errors import RULES, invalid
+from pyro_dynogp.models.layer import Dynamic as Dynamic
+from pyro_dynogp.models.layer import Known as Known
+from pyro_dynogp.models.layer import Layer as Layer
+from pyro_dynogp.models.layer import Limits as Limits
+from pyro_dynogp.models.layer import Static as Static
+from pyro_dynogp.models.layer import StaticLayer as StaticLayer
+from pyro_dynogp.support.errors import invalid
 
 INPUTS = "inputs"
-# Lowest and highest value, None where there is none.
-Limits = tuple[float | None, float | None]
-
-
-@dataclass(frozen=True)
-class Dynamic:
-    """A stochastic LTI layer: its output is the trajectory of a linear system with process noise.
-
-    Args:
-        outputs: width of the layer. pairs: P conjugate pairs (order 2P), shared by all outputs.
-        noise: "shared" or "independent" Brownian motions, see `Modes`.
-        brownian: number of Brownian motions; by default one for each output.
-        feedthrough: whether the layer's input acts on its output at once.
-        process_noise: whether there is any.
-        integrators: 1 for a pole at zero beside the pairs, one for each output: of a plant that
-            integrates its input (a level, a position, a charge).
-        skip: names of earlier signals ("inputs", or layers) that the layer sees beside the
-            output of the layer before it.
-        feedback: names of later static layers whose outputs are further inputs of this layer. Each
-            acts from the sample after the one that it is computed at, and never on the output at
-            once: the loop has a delay.
-        name: prefix of its sites; g, or g1, g2, ... by default.
-    """
-
-    outputs: int = 1
-    pairs: int = 5
-    noise: NoiseStructure = "shared"
-    brownian: int | None = None
-    feedthrough: bool = True
-    process_noise: bool = True
-    integrators: int = 0
-    skip: tuple[str, ...] = ()
-    feedback: tuple[str, ...] = ()
-    name: str | None = None
-
-    @property
-    def modes(self) -> int:
-        """Number of poles that stand for pairs: an integrator counts, and its random walk."""
-        return self.pairs + self.integrators * self.outputs * (2 if self.process_noise else 1)
-
-
-@dataclass(frozen=True)
-class Static:
-    """A static layer: a Gaussian process of the signals below, with inducing values.
-
-    Args:
-        outputs: width of the layer. inducing: number of inducing values for each output.
-        kernel: a gpytorch kernel; Matern-3/2 with a lengthscale for each channel by default.
-        mean: "linear" or "constant" prior mean; by default linear for a first layer, in feedback
-            from several signals and where there are limits, else constant. Beyond the data a
-            function goes back to it; in feedback from one signal it keeps its value, so that what
-            comes back is bounded.
-        limits: lowest and highest value of the linear mean [output], None for none: those of a
-            sensor that stops. Of a last layer of one signal and one output.
-        skip: names of earlier signals that the layer sees too.
-        learn_locations: whether the inducing locations are learnt.
-        support: number of points at which the residual of the function given its inducing values
-            is drawn, where the layer feeds a dynamic one and is not integrated out.
-        name: prefix of its sites; f, or f1, f2, ... by default.
-    """
-
-    outputs: int = 1
-    inducing: int = 32
-    kernel: Kernel | None = None
-    mean: Literal["constant", "linear"] | None = None
-    limits: Limits | None = None
-    skip: tuple[str, ...] = ()
-    learn_locations: bool = True
-    support: int = 64
-    name: str | None = None
-
-
-@dataclass(frozen=True)
-class Known:
-    """A static layer whose function the user writes: a friction law, the root of a level.
-
-    The function sees inputs, and the output that is measured, in the units of the record; as the
-    model's output it gives that output in its units, and sees what a linear model of the record
-    would have as its own. Other signals have no unit: it sees them as they are, and what goes on
-    from it to other layers is shifted and scaled to mean zero and standard deviation one, for
-    normal signals of the size of the training record and parameters in the middle of their priors.
-    The gains of the layer that sees it take up its size and sign: leave them out of the parameters.
-
-    Args:
-        function: torch, differentiable in the parameters and, in models whose trajectories are not
-            integrated out, in the signals; finite everywhere. Called with each signal (*b, n), then
-            the parameters (*b, 1) by name; returns (*b, n), or (*b, n, outputs) for several.
-        parameters: their prior distributions by name, of pyro, of one number each: sites
-            ``<layer>_<name>``.
-        outputs: width of the layer.
-        range: beyond these values of a signal [its unit] the function keeps its value; by default 8
-            standard deviations from the mean of the training record.
-        skip: names of earlier signals that the layer sees too. More than one signal only where all
-            of them are inputs, or static functions of inputs.
-        name: prefix of its sites; f, or f1, f2, ... by default.
-
-    Example:
-        >>> import pyro.distributions as dist
-        >>> friction = Known(lambda v, w: (v / w).tanh(), {"w": dist.LogNormal(0.0, 1.0)})
-        >>> friction.outputs, sorted(friction.parameters)
-        (1, ['w'])
-    """
-
-    function: Callable[..., Tensor]
-    parameters: Mapping[str, dist.Distribution] = field(default_factory=dict)
-    outputs: int = 1
-    range: tuple[float, float] | None = None
-    skip: tuple[str, ...] = ()
-    name: str | None = None
-    support: ClassVar[int] = 0  # points at which the rest of the function is drawn
-
-
-StaticLayer = Static | Known
-Layer = Dynamic | StaticLayer
 
 
 @dataclass(frozen=True)
@@ -205,14 +91,8 @@ def wire(inputs: int, layers: Sequence[Layer], output: str | None = None) -> tup
     before: str = INPUTS
     for place, (name, layer) in enumerate(zip(names, layers, strict=True)):
         _check_layer(name, layer)
-        for skipped in layer.skip:
-            if skipped not in width or skipped == before:
-                raise invalid(
-                    f"skip of layer {name!r}",
-                    expected=f"names of earlier signals, {sorted(set(width) - {before})}",
-                    got=repr(skipped),
-                )
-        sources = (before, *layer.skip)
+        sources = layer.sees or (before, *layer.skip)
+        _check_sources(name, layer, width, before)
         channels = sum(width[s] for s in sources)
         if isinstance(layer, StaticLayer) and channels == 0:
             raise invalid(
@@ -271,6 +151,21 @@ def _names(layers: Sequence[Layer]) -> list[str]:
     return names
 
 
+def _check_sources(name: str, layer: Layer, width: Mapping[str, int], before: str) -> None:
+    option = "sees" if layer.sees else "skip"
+    named = layer.sees or layer.skip
+    expected = set(width) if layer.sees else set(width) - {before}
+    repeated = isinstance(named, str) or len(set(named)) < len(named)
+    for signal in [named] if repeated else [n for n in named if n not in expected]:
+        raise invalid(
+            f"{option} of layer {name!r}",
+            expected=f"names of earlier signals, a tuple of {sorted(expected)}",
+            got=repr(signal),
+        )
+    if layer.sees and layer.skip:
+        raise invalid(f"layer {name!r}", expected="sees or skip", got="both")
+
+
 def _letter(layer: Layer) -> str:
     return "g" if isinstance(layer, Dynamic) else "f"
 
@@ -308,18 +203,14 @@ def _check_that_all_matter(wires: Sequence[Wire], output: str) -> None:
 
 
 def _check_layer(name: str, layer: Layer) -> None:
+    numbers = {"outputs": layer.outputs}
     if isinstance(layer, Dynamic):
+        numbers["pairs"] = layer.pairs
         if layer.noise not in ("shared", "independent"):
             raise invalid(
                 f"noise of layer {name!r}",
                 expected="'shared' or 'independent'",
                 got=repr(layer.noise),
-            )
-        if layer.integrators not in (0, 1):
-            raise invalid(
-                f"integrators of layer {name!r}",
-                expected="0, or 1 for one of each output",
-                got=repr(layer.integrators),
             )
     elif isinstance(layer, Known):
         low, high = layer.range or (0.0, 1.0)
@@ -329,16 +220,19 @@ def _check_layer(name: str, layer: Layer) -> None:
             got = repr(layer.function)
             raise invalid(f"function of layer {name!r}", expected="a function of torch", got=got)
     else:
+        numbers["inducing"] = layer.inducing
+        numbers["support"] = layer.support
         if layer.mean not in (None, "constant", "linear"):
             raise invalid(
                 f"mean of layer {name!r}",
                 expected="'constant' or 'linear'",
                 got=repr(layer.mean),
             )
-    for option in fields(layer):
-        value = getattr(layer, option.name)
-        if option.name in RULES and not (value is None and option.default is None):
-            RULES[option.name].check(f"{option.name} of layer {name!r}", value)
+    for argument, value in numbers.items():
+        if not isinstance(value, int) or value < 1:
+            raise invalid(
+                f"{argument} of layer {name!r}", expected="a whole number >= 1", got=repr(value)
+            )
 
 
 def _check_limits(name: str, layer: Static, channels: int, last: bool) -> None:

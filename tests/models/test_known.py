@@ -12,7 +12,9 @@ from scipy.stats import ks_2samp
 import pyro_dynogp as dgp
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.density import Potential
-from pyro_dynogp.layers.sites import sample
+from pyro_dynogp.inference.starts.plans import Plan, starting_point
+from pyro_dynogp.layers.sites import Site, sample
+from pyro_dynogp.models.known import middle_of
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.wiring import Dynamic, Known
 from tests.models.closed_loops import make_record, plain_loop, system_at
@@ -215,3 +217,18 @@ def test_several_signals_of_a_trajectory_are_refused():
 def test_priors_are_of_double_precision():
     model = looped(tanh, {"width": dist.HalfCauchy(1.0)})
     assert values_at(model, 0)["f_width"].dtype == torch.float64
+
+
+def test_a_climb_starts_in_the_middle_of_the_priors_with_little_feedback():
+    """A learnt function comes back as nothing at first; a known one by gains that are small."""
+    record = make_record()
+    model = looped(tanh, {"width": dist.LogNormal(0.7, 0.5)}, record)
+    linear = dgp.LinearDynamicGP(1, pairs=2).scaled_to(record)
+    values = starting_point(
+        model, model.prepare(record), Plan("g", values_at(linear, 0), False, seed=0)
+    )
+    assert float(values["f_width"]) == pytest.approx(np.exp(0.7), rel=1e-6)
+    assert float(values["g_input_gain"][:, 1].abs().max()) < 0.25
+    half = Site("x", dist.HalfCauchy(torch.tensor(1.0).double()), ())
+    assert float(middle_of(half)) == 1.0  # there is no mean
+    assert float(middle_of(Site("x", dist.Gamma(2.0, 4.0), ()))) == 0.5

@@ -51,7 +51,7 @@ def test_a_first_static_layer_has_a_linear_mean_others_a_constant_one():
 
 @pytest.mark.parametrize(("inputs", "layers", "message"), [
     (1, (), "layers: expected at least one layer"),
-    (1, ("dynamic",), "expected Dynamic and Static layers, got 'dynamic'"),
+    (1, ("dynamic",), "expected Dynamic, Static and Known layers, got 'dynamic'"),
     (1, (Dynamic(name="a"), Static(name="a")), "a name of its own for each layer"),
     (1, (Dynamic(name="f"), Static()), "a name of its own for each layer"),
     (1, (Dynamic(name="y"),), "none of .*'y'"),

@@ -20,6 +20,8 @@ Values = dict[str, Tensor]
 SMALL = 0.05
 # Sites of integrators, a row for each output.
 INTEGRATORS = ("integrator_gain", "integrator_drift", "integrator_noise")
+# Standard deviation of the logarithms by which poles are moved for a layer beside another.
+MOVED = 0.5
 
 
 class DynamicStart:
@@ -47,12 +49,16 @@ class DynamicStart:
     def _random(self, *shape: int, scale: float = SMALL) -> Tensor:
         return torch.tensor(scale * self.generator.standard_normal(shape), dtype=torch.float64)
 
-    def from_linear(self, linear: Mapping[str, Tensor]) -> Values:
-        """The linear optimum's values under this layer's names."""
+    def from_linear(self, linear: Mapping[str, Tensor], moved: bool = False) -> Values:
+        """The linear optimum's values under this layer's names; `moved`: its poles at random."""
         values = {
             self.one.name + name[1:]: value for name, value in linear.items() if name[:2] == "g_"
         }
         layer = self.layer
+        for name in ("log_decay", "log_frequency") if moved else ():
+            values[self._key(name)] = values[self._key(name)] + self._random(
+                layer.pairs, scale=MOVED
+            )
         if self.one.fed:
             none = torch.zeros(layer.pairs, 0, 2, dtype=torch.float64)
             gain = values.get(self._key("input_gain"), none)

@@ -101,10 +101,10 @@ def plans(
 def starting_point(model: Model, records: Sequence[PreparedRecord], plan: Plan) -> Values:
     """Values of every site of a cascade, layer by layer along the mean trajectories.
 
-    The leading layer is the linear fit, other dynamic layers pass their input on with small random
-    dynamics beside it, and static layers start as the identity on the range of their input: the
-    cascade starts as the linear model, whose offset and noise it takes over. From static layers in
-    feedback nothing comes back at first.
+    The leading layer is the linear fit, a layer beside it has its modes, moved at random, other
+    dynamic layers pass their input on with small random dynamics beside it, and static layers start
+    as the identity on the range of their input: the cascade starts as the linear model, whose
+    offset and noise it takes over. From static layers in feedback nothing comes back at first.
     """
     generator = np.random.default_rng(plan.seed)
     values: Values = {}
@@ -129,6 +129,8 @@ def starting_point(model: Model, records: Sequence[PreparedRecord], plan: Plan) 
             start = DynamicStart(model, one, one.layer, scaling, generator)
             if one.name == plan.leading and plan.linear is not None:
                 values.update(start.from_linear(plan.linear))
+            elif plan.linear is not None and _beside(model, one, plan.leading):
+                values.update(start.from_linear(plan.linear, moved=True))
             else:
                 values.update(start.near_identity())
             outputs = [start.response(values, r, x) for r, x in zip(records, seen, strict=True)]
@@ -181,6 +183,12 @@ def starting_point(model: Model, records: Sequence[PreparedRecord], plan: Plan) 
         if site.name not in values:
             values[site.name] = site.typical()
     return {name: value.detach().clone() for name, value in values.items()}
+
+
+def _beside(model: Model, one: Wire, leading: str | None) -> bool:
+    """Whether a layer is of the same form as the leading one, and sees the same."""
+    same = {w.name: (w.sources, w.fed, replace(d, name=None)) for w, d in model.dynamic}
+    return leading is not None and same[one.name] == same[leading]
 
 
 def _direct(model: Model, plan: Plan) -> Tensor:

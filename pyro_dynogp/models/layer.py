@@ -1,0 +1,132 @@
+"""The layers that models are made of, as a user writes them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal
+
+import pyro.distributions as dist
+from gpytorch.kernels import Kernel
+from torch import Tensor
+
+from pyro_dynogp.lti.modes import NoiseStructure
+
+# Lowest and highest value, None where there is none.
+Limits = tuple[float | None, float | None]
+
+
+@dataclass(frozen=True)
+class Dynamic:
+    """A stochastic LTI layer: its output is the trajectory of a linear system with process noise.
+
+    Args:
+        outputs: width of the layer. pairs: P conjugate pairs (order 2P), shared by all outputs.
+        noise: "shared" or "independent" Brownian motions, see `Modes`.
+        brownian: number of Brownian motions; by default one for each output.
+        feedthrough: whether the layer's input acts on its output at once.
+        process_noise: whether there is any.
+        integrators: 1 for a pole at zero beside the pairs, one for each output: of a plant that
+            integrates its input (a level, a position, a charge).
+        skip: names of earlier signals ("inputs", or layers) that the layer sees beside the
+            output of the layer before it.
+        sees: names of the earlier signals that it sees instead, for branches side by side.
+        feedback: names of later static layers whose outputs are further inputs of this layer. Each
+            acts from the sample after the one that it is computed at, and never on the output at
+            once: the loop has a delay.
+        name: prefix of its sites; g, or g1, g2, ... by default.
+    """
+
+    outputs: int = 1
+    pairs: int = 5
+    noise: NoiseStructure = "shared"
+    brownian: int | None = None
+    feedthrough: bool = True
+    process_noise: bool = True
+    integrators: int = 0
+    skip: tuple[str, ...] = ()
+    sees: tuple[str, ...] = ()
+    feedback: tuple[str, ...] = ()
+    name: str | None = None
+
+    @property
+    def modes(self) -> int:
+        """Number of poles that stand for pairs: an integrator counts, and its random walk."""
+        return self.pairs + self.integrators * self.outputs * (2 if self.process_noise else 1)
+
+
+@dataclass(frozen=True)
+class Static:
+    """A static layer: a Gaussian process of the signals below, with inducing values.
+
+    Args:
+        outputs: width of the layer. inducing: number of inducing values for each output.
+        kernel: a gpytorch kernel; Matern-3/2 with a lengthscale for each channel by default.
+        mean: "linear" or "constant" prior mean; by default linear for a first layer, in feedback
+            from several signals and where there are limits, else constant. Beyond the data a
+            function goes back to it; in feedback from one signal it keeps its value, so that what
+            comes back is bounded.
+        limits: lowest and highest value of the linear mean [output], None for none: those of a
+            sensor that stops. Of a last layer of one signal and one output.
+        skip: names of earlier signals that the layer sees too. sees: those that it sees instead.
+        learn_locations: whether the inducing locations are learnt.
+        support: number of points at which the residual of the function given its inducing values
+            is drawn, where the layer feeds a dynamic one and is not integrated out.
+        name: prefix of its sites; f, or f1, f2, ... by default.
+    """
+
+    outputs: int = 1
+    inducing: int = 32
+    kernel: Kernel | None = None
+    mean: Literal["constant", "linear"] | None = None
+    limits: Limits | None = None
+    skip: tuple[str, ...] = ()
+    sees: tuple[str, ...] = ()
+    learn_locations: bool = True
+    support: int = 64
+    name: str | None = None
+
+
+@dataclass(frozen=True)
+class Known:
+    """A static layer whose function the user writes: a friction law, the root of a level.
+
+    The function sees inputs, and the output that is measured, in the units of the record; as the
+    model's output it gives that output in its units, and sees what a linear model of the record
+    would have as its own. Other signals have no unit: it sees them as they are, and what goes on
+    from it to other layers is shifted and scaled to mean zero and standard deviation one, for
+    normal signals of the size of the training record and parameters in the middle of their priors.
+    The gains of the layer that sees it take up its size and sign: leave them out of the parameters.
+
+    Args:
+        function: torch, differentiable in the parameters and, in models whose trajectories are not
+            integrated out, in the signals; finite everywhere. Called with each signal (*b, n), then
+            the parameters (*b, 1) by name; returns (*b, n), or (*b, n, outputs) for several.
+        parameters: their prior distributions by name, of pyro, of one number each: sites
+            ``<layer>_<name>``.
+        outputs: width of the layer.
+        range: beyond these values of a signal [its unit] the function keeps its value; by default 8
+            standard deviations from the mean of the training record.
+        skip: names of earlier signals that the layer sees too. sees: those that it sees instead.
+            More than one signal only where all of them are inputs, or static functions of inputs.
+        name: prefix of its sites; f, or f1, f2, ... by default.
+
+    Example:
+        >>> import pyro.distributions as dist
+        >>> friction = Known(lambda v, w: (v / w).tanh(), {"w": dist.LogNormal(0.0, 1.0)})
+        >>> friction.outputs, sorted(friction.parameters)
+        (1, ['w'])
+    """
+
+    function: Callable[..., Tensor]
+    parameters: Mapping[str, dist.Distribution] = field(default_factory=dict)
+    outputs: int = 1
+    range: tuple[float, float] | None = None
+    skip: tuple[str, ...] = ()
+    sees: tuple[str, ...] = ()
+    name: str | None = None
+    support: ClassVar[int] = 0  # points at which the rest of the function is drawn
+
+
+StaticLayer = Static | Known
+Layer = Dynamic | StaticLayer
