@@ -31,7 +31,7 @@ from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import Response, as_inputs, mean_response
 from pyro_dynogp.lti.semiseparable import SemiseparableCovariance
 from pyro_dynogp.lti.state import ModalState
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import instance, invalid
 from pyro_dynogp.support.tensors import Numbers, as_tensor, broadcast
 
 
@@ -68,7 +68,12 @@ class LTIProcess(Trajectory):
         offset: Numbers | None = None,
         validate_args: bool | None = None,
     ) -> None:
+        instance("modes", modes, Modes)
         self.modes = modes
+        if not isinstance(time, TimeGrid):
+            time = as_tensor(time, argument="time")
+        if inputs is not None:
+            inputs = as_tensor(inputs, argument="inputs")
         self.grid = time_grid(time).to(modes.poles.device)
         self.inputs = as_inputs(modes, self.grid, inputs)
         if initial_state is not None and not isinstance(initial_state, ModalState):

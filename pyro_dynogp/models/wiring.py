@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from numbers import Real
 from typing import Literal
 
 from gpytorch.kernels import Kernel
 
+from pyro_dynogp.layers.kernels import KernelPrior
 from pyro_dynogp.lti.modes import NoiseStructure
-from pyro_dynogp.support.errors import RULES, invalid
+from pyro_dynogp.support.errors import COUNT, RULES, instance, invalid
 
 INPUTS = "inputs"
 # Lowest and highest value, None where there is none.
@@ -147,12 +150,13 @@ def wire(inputs: int, layers: Sequence[Layer], output: str | None = None) -> tup
         raise invalid("output", expected=f"one of the layers {names}", got=repr(output))
     _check_feedback(names, layers)
     widths = {name: layer.outputs for name, layer in zip(names, layers, strict=True)}
+    for name, layer in zip(names, layers, strict=True):
+        _check_layer(name, layer)
     back = {source for layer in layers if isinstance(layer, Dynamic) for source in layer.feedback}
     width = {INPUTS: inputs}
     wires: list[Wire] = []
     before: str = INPUTS
     for place, (name, layer) in enumerate(zip(names, layers, strict=True)):
-        _check_layer(name, layer)
         for skipped in layer.skip:
             if skipped not in width or skipped == before:
                 raise invalid(
@@ -202,6 +206,11 @@ def _names(layers: Sequence[Layer]) -> list[str]:
     for layer in layers:
         if not isinstance(layer, Dynamic | Static):
             raise invalid("layers", expected="Dynamic and Static layers", got=repr(layer))
+        if layer.name is not None and not (
+            isinstance(layer.name, str) and layer.name.isidentifier()
+        ):
+            expected = "None, or letters, digits and underscores"
+            raise invalid("name of a layer", expected=expected, got=repr(layer.name))
         kinds.append(type(layer))
     names = []
     for place, (kind, layer) in enumerate(zip(kinds, layers, strict=True)):
@@ -219,12 +228,14 @@ def _names(layers: Sequence[Layer]) -> list[str]:
 
 def _check_feedback(names: Sequence[str], layers: Sequence[Layer]) -> None:
     for place, layer in enumerate(layers):
+        instance(f"skip of layer {names[place]!r}", layer.skip, tuple)
         if not isinstance(layer, Dynamic):
             continue
+        instance(f"feedback of layer {names[place]!r}", layer.feedback, tuple)
         later = [n for n, other in zip(names, layers, strict=True) if isinstance(other, Static)]
         later = [n for n in later if names.index(n) > place]
         given = layer.feedback
-        if isinstance(given, str) or len(set(given)) < len(given) or not set(given) <= set(later):
+        if len(set(given)) < len(given) or not set(given) <= set(later):
             raise invalid(
                 f"feedback of layer {names[place]!r}",
                 expected=f"a tuple of names of later static layers, of {later}",
@@ -250,30 +261,21 @@ def _check_that_all_matter(wires: Sequence[Wire], output: str) -> None:
 
 
 def _check_layer(name: str, layer: Layer) -> None:
-    if isinstance(layer, Dynamic):
-        if layer.noise not in ("shared", "independent"):
-            raise invalid(
-                f"noise of layer {name!r}",
-                expected="'shared' or 'independent'",
-                got=repr(layer.noise),
-            )
-    else:
-        if layer.mean not in (None, "constant", "linear"):
-            raise invalid(
-                f"mean of layer {name!r}",
-                expected="'constant' or 'linear'",
-                got=repr(layer.mean),
-            )
     for field in fields(layer):
         value = getattr(layer, field.name)
         if field.name in RULES and not (value is None and field.default is None):
             RULES[field.name].check(f"{field.name} of layer {name!r}", value)
+    if isinstance(layer, Static):
+        COUNT.check(f"support of layer {name!r}", layer.support)
+        KernelPrior(name, layer.kernel, 1)  # refuses what is no kernel of one function
 
 
 def _check_limits(name: str, layer: Static, channels: int, last: bool) -> None:
     assert layer.limits is not None
-    known = [limit for limit in layer.limits if limit is not None]
-    if len(layer.limits) != 2 or not known or known != sorted(set(known)):
+    limits = layer.limits if isinstance(layer.limits, tuple | list) else ()
+    known = [limit for limit in limits if limit is not None]
+    numbers = all(isinstance(limit, Real) and not math.isnan(limit) for limit in known)
+    if len(limits) != 2 or not known or not numbers or known != sorted(set(known)):
         raise invalid(
             f"limits of layer {name!r}",
             expected="(low, high) with low < high; None for one that is not there",
