@@ -124,6 +124,7 @@ class Fitted:
             return self.model.collapsed.system(values, self.scaling)
 
     @property
+    @isolated
     def modes(self) -> Modes:
         """Poles and gains in the units of the record; batch (S,) of draws, none for "map".
 
@@ -136,6 +137,7 @@ class Fitted:
         return modes[0] if self.method == "map" else modes
 
     @property
+    @isolated
     def noise_sd(self) -> np.ndarray:
         """Posterior mean of the measurement noise's scale (n_y,) [output]."""
         sd = self.system.noise.constant_sd

@@ -180,7 +180,8 @@ TABLE: dict[str, Entry] = {
                        step=1.0, duration=100.0),
     "Mode": plain(dgp.Mode, {"optimizer": NAME}),
     "Normal": plain(dgp.Normal, {"family": (*NAME, None), **VARIATIONAL, "optimizer": NAME}),
-    "Nuts": plain(dgp.Nuts, {"chains": COUNT, "warmup": COUNT, "draws": (*COUNT, 3), "optimizer": NAME}),
+    "Nuts": plain(dgp.Nuts, {"chains": COUNT, "warmup": COUNT, "draws": (*COUNT, 3),
+                             "optimizer": NAME}),
     "Trajectories": plain(dgp.Trajectories, {"guide": (torch.nn.Linear(1, 1),), **VARIATIONAL}),
     "LoopSettings": plain(dgp.LoopSettings, {
         f.name: (0, -1, np.nan, "a", None, *((1.5, True) if isinstance(f.default, int) else ()))
