@@ -11,8 +11,9 @@ LINES_OF_A_FUNCTION = 80  # its docstring not counted
 ARGUMENTS = 12
 LINES = 31_500
 # The package of two versions before had 34 928; kernels in lanes, the density without tracing,
-# Gauss-Newton (1900 lines) and nonlinear feedback (650 lines) came since. To shrink, and to go.
-LINES_TODAY = 39_100
+# Gauss-Newton (1900 lines) and nonlinear feedback (650 lines) came since, then rules of arguments,
+# digests of contents and isolation (620 lines). To shrink, and to go.
+LINES_TODAY = 39_725
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

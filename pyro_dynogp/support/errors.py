@@ -107,7 +107,8 @@ def instance(argument: str, value: object, kind: type, advice: str = "") -> None
     """
     if not isinstance(value, kind):
         expected = f"a {kind.__name__}"
-        raise invalid(argument, expected=expected, got=type(value).__name__, advice=advice)
+        got = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
+        raise invalid(argument, expected=expected, got=got, advice=advice)
 
 
 SWITCH = Rule(
