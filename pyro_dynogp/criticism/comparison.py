@@ -212,8 +212,6 @@ def stack(
     """
     if not isinstance(fits, Mapping) or not fits:
         raise invalid("fits", expected="fits by name", got=repr(fits))
-    for name, fit in fits.items():
-        known_fit(fit, f"fits[{name!r}]")
     if weights is None:
         if target is None:
             raise invalid(
@@ -224,9 +222,11 @@ def stack(
     numbers = weights.weights if isinstance(weights, Comparison) else weights
     if not isinstance(numbers, Mapping):
         raise invalid("weights", expected="a Comparison, or numbers by name", got=repr(numbers))
-    values = [POSITIVE_OR_ZERO.check("weights", numbers.get(str(name))) for name in fits]
-    if not (np.isfinite(values).all() and min(values) >= 0.0 and sum(values) > 0.0):
+    values = [POSITIVE_OR_ZERO.plain(numbers.get(str(name))) for name in fits]
+    if None in values or not sum(values) > 0.0:
         raise invalid("weights", expected=f"numbers >= 0 for {list(fits)}", got=repr(numbers))
+    for name, fit in fits.items():
+        known_fit(fit, f"fits[{name!r}]")
     total = float(sum(values))
     shares = {name: float(v) / total for name, v in zip(fits, values, strict=True)}
     kept = {name: fit for name, fit in fits.items() if shares[name] > 1e-6}
