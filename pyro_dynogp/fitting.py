@@ -13,7 +13,7 @@ import torch
 from pyro_dynogp.criticism import inference_data
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference import storage
-from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.fitted import Fitted, known_fit
 from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.inference.methods.base import Method, Problem
 from pyro_dynogp.inference.methods.choose import method_of
@@ -29,6 +29,7 @@ from pyro_dynogp.prediction import predict as _predict
 from pyro_dynogp.prediction.first_state import beginning
 from pyro_dynogp.prediction.layers import LayerTrajectory, StaticBand
 from pyro_dynogp.prediction.prediction import Prediction
+from pyro_dynogp.support.errors import instance
 
 __all__ = ["Fit", "fit", "load"]
 
@@ -240,6 +241,9 @@ def fit(
         ValueError: on channels that do not fit the model, constant or entirely missing outputs,
             unknown options or such that the method does not use, or where no start leads anywhere.
     """
+    instance("model", model, Model, "LinearDynamicGP, Wiener, Cascade, ... make one.")
+    if start is not None:
+        known_fit(start, "start")
     chosen = method_of(method, model, options)
     run = Run(seed, workers, progress, restarts=restarts, steps=steps)
     chosen.check(model, warm=start is not None)

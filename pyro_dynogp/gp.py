@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.lti.covariance import autocovariance
+from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import hold, mean_response
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import instance, invalid
 from pyro_dynogp.support.tensors import Numbers, as_tensor
 
 
@@ -26,6 +27,7 @@ class LTIParameters(gpytorch.Module):
 
     def __init__(self, modes: Modes) -> None:
         super().__init__()
+        instance("modes", modes, Modes)
         if modes.batch_shape or modes.several_outputs or bool((modes.poles == 0).any()):
             expected = "one output, no batch dimensions, stable poles"
             raise invalid("modes", expected=expected, got=repr(modes))
@@ -56,7 +58,10 @@ class LTIParameters(gpytorch.Module):
 
 
 def _parameters(system: Modes | LTIParameters) -> LTIParameters:
-    return system if isinstance(system, LTIParameters) else LTIParameters(system)
+    if isinstance(system, LTIParameters):
+        return system
+    instance("system", system, Modes)
+    return LTIParameters(system)
 
 
 class LTIKernel(gpytorch.kernels.Kernel):
@@ -112,8 +117,8 @@ class LTIMean(gpytorch.means.Mean):
         self.system = _parameters(system)
         if (time is None) != (inputs is None):
             raise invalid("time, inputs", expected="both or neither", got="one of them")
-        self.time = None if time is None else as_tensor(time)
-        self.inputs = None if inputs is None else as_tensor(inputs)
+        self.time = None if time is None else time_grid(as_tensor(time, argument="time")).time
+        self.inputs = None if inputs is None else as_tensor(inputs, argument="inputs")
         if self.inputs is not None and self.inputs.dim() == 1:
             self.inputs = self.inputs.unsqueeze(-1)
 

@@ -14,10 +14,10 @@ from pyro_dynogp.criticism.calibration import calibration
 from pyro_dynogp.criticism.finding import Finding, apart
 from pyro_dynogp.criticism.posterior_draws import DRAWS, PosteriorDraws, draws_of, log_joint_of
 from pyro_dynogp.criticism.twin import twin_findings
+from pyro_dynogp.inference.fitted import known_fit
 from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.inference.stability import warnings_of
 from pyro_dynogp.prediction.predict import predict
-from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
     from pyro_dynogp.inference.fitted import Fitted
@@ -107,8 +107,7 @@ def check(
         ValueError: where the fit does not know its training records; on a twin of a fit with
             trajectories as sites or by NUTS, or of fewer than 20 or more samples than there are.
     """
-    if not fit.records:
-        raise invalid("fit", expected="a fit that knows its training records", got="none")
+    known_fit(fit)
     findings: list[Finding] = []
     compared: list[Finding] = []
     if twin is not False:  # first: this is where it may be refused

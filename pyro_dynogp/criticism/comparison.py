@@ -12,10 +12,11 @@ import pandas as pd
 from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.loo import Target, loo
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.inference.fitted import known_fit
 from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.prediction import predict as predicting
 from pyro_dynogp.prediction.prediction import Parts, Prediction
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import POSITIVE_OR_ZERO, invalid, one_of
 
 if TYPE_CHECKING:
     from pyro_dynogp.inference.fitted import Fitted
@@ -90,6 +91,7 @@ def compare(
     """
     if not isinstance(models, Mapping) or len(models) < 2:
         raise invalid("models", expected="two models or more by name", got=repr(type(models)))
+    one_of(("stacking", "BB-pseudo-BMA", "pseudo-BMA")).check("method", method)
     elpds = {}
     for name, one in models.items():
         known = isinstance(one, pd.Series) and "elpd_loo" in one
@@ -208,6 +210,8 @@ def stack(
         weights: a `Comparison` of them, or numbers >= 0 by name. None: `compare` is run, for
             `target` and with `options`.
     """
+    if not isinstance(fits, Mapping) or not fits:
+        raise invalid("fits", expected="fits by name", got=repr(fits))
     if weights is None:
         if target is None:
             raise invalid(
@@ -215,10 +219,14 @@ def stack(
                 advice="Or give weights.",
             )  # fmt: skip
         weights = compare(fits, target=target, **options)
-    numbers = weights.weights if isinstance(weights, Comparison) else dict(weights)
-    values = [numbers.get(str(name), np.nan) for name in fits]
-    if not (np.isfinite(values).all() and min(values) >= 0.0 and sum(values) > 0.0):
+    numbers = weights.weights if isinstance(weights, Comparison) else weights
+    if not isinstance(numbers, Mapping):
+        raise invalid("weights", expected="a Comparison, or numbers by name", got=repr(numbers))
+    values = [POSITIVE_OR_ZERO.plain(numbers.get(str(name))) for name in fits]
+    if None in values or not sum(values) > 0.0:
         raise invalid("weights", expected=f"numbers >= 0 for {list(fits)}", got=repr(numbers))
+    for name, fit in fits.items():
+        known_fit(fit, f"fits[{name!r}]")
     total = float(sum(values))
     shares = {name: float(v) / total for name, v in zip(fits, values, strict=True)}
     kept = {name: fit for name, fit in fits.items() if shares[name] > 1e-6}

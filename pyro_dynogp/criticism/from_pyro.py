@@ -22,7 +22,7 @@ from pyro_dynogp.criticism.pyro_posterior import PyroPosterior
 from pyro_dynogp.criticism.site_densities import is_masked, is_trajectory
 from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.layers.sites import Arguments, Program
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import instance, invalid
 from pyro_dynogp.support.parallel import seeded
 
 __all__ = ["PyroPosterior", "from_pyro"]
@@ -62,6 +62,14 @@ def from_pyro(
     """
     if not callable(model):
         raise invalid("model", expected="a Pyro model", got=type(model).__name__)
+    for name, given in (
+        ("observed", observed),
+        ("coords", coords),
+        ("dims", dims),
+        ("units", units),
+    ):
+        if given is not None:
+            instance(name, given, Mapping)
     if observed is not None:
         data = {name: torch.as_tensor(value) for name, value in observed.items()}
         model = pyro.poutine.condition(model, data=data)

@@ -25,6 +25,7 @@ from pyro_dynogp.criticism.site_dimensions import (
 )
 from pyro_dynogp.criticism.subjects import densities_at
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.records import one_record
 from pyro_dynogp.models.output_process import OutputProcess
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.prediction.first_state import beginning
@@ -51,6 +52,8 @@ def to_arviz(
     seed: int = 0,
 ) -> Any:
     """ArviZ's InferenceData of a fit; see `Fit.to_arviz`."""
+    if future is not None:
+        one_record(future, "Export one forecast at a time.", "future")
     export = _Export(fit, samples, seed)
     groups: dict[str, xr.Dataset] = {}
     if future is not None:  # first: this is where a record may be refused

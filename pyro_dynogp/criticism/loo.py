@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -13,11 +13,9 @@ from pyro_dynogp.criticism.posterior_draws import DRAWS
 from pyro_dynogp.criticism.subjects import FitSubject, Parameters, Subject
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.records import as_records
+from pyro_dynogp.inference.fitted import Fitted, known_fit
 from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.support.errors import invalid
-
-if TYPE_CHECKING:
-    from pyro_dynogp.inference.fitted import Fitted
 
 Target = Literal["missing sample", "forecast", "new record"]
 TARGETS = get_args(Target)
@@ -109,15 +107,14 @@ def subject_of(
     progress: bool = False,
 ) -> Subject:
     """What `loo` works on."""
-    from pyro_dynogp.inference.fitted import Fitted
-
     if not isinstance(fit, Fitted):
         if not all(hasattr(fit, name) for name in ("draws", "pointwise", "places", "data")):
             raise invalid("fit", expected="a Fit, or a Subject", got=type(fit).__name__)
         return fit
-    if not fit.records:
-        raise invalid("fit", expected="a fit that knows its training records", got="none")
+    known_fit(fit)
     records = fit.records if record is None else as_records(record)
+    if record is not None:
+        fit.model.check(records)
     unknown = [one.name for one in records if one.fingerprint not in fit.training]
     if unknown or len(records) != len(fit.records):
         raise invalid(

@@ -115,6 +115,8 @@ def as_texts(
     if value is None:
         several = default and count > 1
         return tuple(f"{default}{i + 1}" if several else default for i in range(count))
+    if not isinstance(value, str | Sequence | np.ndarray):
+        raise invalid(argument, expected=f"{count} texts", got=repr(value))
     texts = as_names(value)
     wrong = [t for t in texts if not isinstance(t, str) or (unique and not t)]
     if wrong or len(texts) != count:

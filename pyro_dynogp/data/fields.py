@@ -15,7 +15,7 @@ from pyro_dynogp.data.checks import (
     frozen,
     read_clock,
 )
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import instance, invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 
 
@@ -45,6 +45,8 @@ def checked(fields: RecordFields) -> dict[str, Any]:
     time_unit, extra_units = fields["time_unit"], fields["extra_units"]
     if not isinstance(time_unit, str):
         raise invalid("time_unit", expected='text such as "s" or "h"', got=repr(time_unit))
+    for name in ("extra", "extra_units"):
+        instance(name, fields[name], Mapping)
     clock, origin = read_clock(fields["time"], fields["start"], time_unit)
     n = len(clock)
     u = as_channels("inputs", fields["inputs"], n)

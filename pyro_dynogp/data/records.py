@@ -8,7 +8,7 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.support.errors import invalid
 
 
-def one_record(record: object, advice: str) -> Record:
+def one_record(record: object, advice: str, argument: str = "record") -> Record:
     """A single record.
 
     Raises:
@@ -16,7 +16,7 @@ def one_record(record: object, advice: str) -> Record:
     """
     if not isinstance(record, Record):
         got = type(record).__name__
-        raise invalid("record", expected="one Record", got=got, advice=advice)
+        raise invalid(argument, expected="one Record", got=got, advice=advice)
     return record
 
 

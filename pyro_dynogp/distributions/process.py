@@ -31,7 +31,7 @@ from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import Response, as_inputs, mean_response
 from pyro_dynogp.lti.semiseparable import SemiseparableCovariance
 from pyro_dynogp.lti.state import ModalState
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import POSITIVE_OR_ZERO, instance, invalid
 from pyro_dynogp.support.tensors import Numbers, as_tensor, broadcast
 
 
@@ -68,7 +68,10 @@ class LTIProcess(Trajectory):
         offset: Numbers | None = None,
         validate_args: bool | None = None,
     ) -> None:
+        instance("modes", modes, Modes)
         self.modes = modes
+        time = time if isinstance(time, TimeGrid) else as_tensor(time, argument="time")
+        inputs = None if inputs is None else as_tensor(inputs, argument="inputs")
         self.grid = time_grid(time).to(modes.poles.device)
         self.inputs = as_inputs(modes, self.grid, inputs)
         if initial_state is not None and not isinstance(initial_state, ModalState):
@@ -77,9 +80,7 @@ class LTIProcess(Trajectory):
         self.initial_state: ModalState | None = initial_state
         if initial_state is not None:
             initial_state.check(modes.pairs)
-        if not jitter >= 0:
-            raise invalid("jitter", expected="a number >= 0", got=repr(jitter))
-        self.jitter = jitter
+        self.jitter: float = POSITIVE_OR_ZERO.check("jitter", jitter)
         shapes = [modes.batch_shape, self.inputs.shape[:-2]]
         if initial_state is not None:
             shapes.append(initial_state.mean.shape[:-1])

@@ -82,7 +82,7 @@ def load(name: str, **options: Any) -> Dataset:
         ValueError: an unknown name or option, or a value that an option does not have.
         FileNotFoundError: the original file is not in `path`.
     """
-    if name not in _LOADERS:
+    if not isinstance(name, str) or name not in _LOADERS:
         raise invalid("name", expected=f"one of {list(_LOADERS)}", got=repr(name))
     known = list(inspect.signature(_LOADERS[name]).parameters)
     for option in options:

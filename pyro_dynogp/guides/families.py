@@ -27,7 +27,7 @@ from pyro_dynogp.guides.coordinates import (
     unconstrained,
 )
 from pyro_dynogp.guides.normal import FlatNormal
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import invalid, verify_fields
 from pyro_dynogp.support.tensors import as_tensor
 
 
@@ -77,6 +77,9 @@ class SameAsPrior(Family):
 class _Started(Family):
     # The start in the coordinates of the parameters; LayerGuide fills it in.
     at: Tensor | None = field(default=None, kw_only=True, repr=False)
+
+    def __post_init__(self) -> None:
+        verify_fields(self)
 
     @property
     def start(self) -> Tensor | None:
@@ -141,8 +144,6 @@ class MeanField(_Started):
 
     def posterior(self, name: str, prior: dist.TorchDistribution) -> dist.TorchDistribution:
         """A normal, transformed where the support is not all real numbers."""
-        if not self.init_scale > 0:
-            raise invalid("init_scale", expected="a number > 0", got=repr(self.init_scale))
         transform = to_support(name, prior)
         event_dim = transform.domain.event_dim
         loc = parameter(f"{name}.loc", lambda: self._at(name, prior), event_dim)

@@ -20,7 +20,7 @@ from pyro_dynogp.distributions.process import LTIProcess
 from pyro_dynogp.guides.coordinates import joint_normal, middle, to_support, unconstrained
 from pyro_dynogp.guides.families import Family, default_family
 from pyro_dynogp.guides.normal import PlacedDelta
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import RULES, instance, invalid
 from pyro_dynogp.support.tensors import as_tensor, broadcast
 
 # The auxiliary site of the joint normal, and the prefix of its parameters.
@@ -80,6 +80,13 @@ class LayerGuide:
         joint_scale: float = 0.05,
         observed: Sequence[str] = (),
     ) -> None:
+        if not callable(model):
+            raise invalid("model", expected="a Pyro model", got=type(model).__name__)
+        for name, family in (families or {}).items() if isinstance(families, Mapping) else ():
+            instance(f"families[{name!r}]", family, Family)
+        if families is not None:
+            instance("families", families, Mapping)
+        RULES["joint_scale"].check("joint_scale", joint_scale)
         self.model = model
         self.given, self.default = dict(families or {}), default
         self.values = {name: as_tensor(x) for name, x in (values or {}).items()}

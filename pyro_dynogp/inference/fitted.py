@@ -20,8 +20,19 @@ from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import with_outputs
 from pyro_dynogp.models.system import System
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import instance, invalid
 from pyro_dynogp.support.frozen import FrozenMapping
+
+
+def known_fit(fit: object, argument: str = "fit") -> None:
+    """Refuse what is no fit, or a fit without its training records.
+
+    Raises:
+        ValueError: see above.
+    """
+    instance(argument, fit, Fitted, "dgp.fit(...) makes one.")
+    if not getattr(fit, "records", ()):
+        raise invalid(argument, expected="a fit that knows its training records", got="none")
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +124,7 @@ class Fitted:
             return self.model.collapsed.system(values, self.scaling)
 
     @property
+    @isolated
     def modes(self) -> Modes:
         """Poles and gains in the units of the record; batch (S,) of draws, none for "map".
 
@@ -125,6 +137,7 @@ class Fitted:
         return modes[0] if self.method == "map" else modes
 
     @property
+    @isolated
     def noise_sd(self) -> np.ndarray:
         """Posterior mean of the measurement noise's scale (n_y,) [output]."""
         sd = self.system.noise.constant_sd

@@ -21,7 +21,7 @@ def train_model(
     """
     kept = Checkpoints.at(
         checkpoint,
-        model=problem.model,
+        model=replace(problem.model, scaling=None),  # the scaling is the records'
         record=[each.record.fingerprint for each in problem.records],
         start=problem.learnt,
         method=method,

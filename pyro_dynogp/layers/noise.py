@@ -15,7 +15,7 @@ from torch import Tensor
 from pyro_dynogp.layers.functions import StaticFunction
 from pyro_dynogp.layers.sites import Site, Values
 from pyro_dynogp.layers.static import StaticPrior
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import POSITIVE, invalid, one_of, verify_fields
 
 # What varying noise is a function of.
 Driver = Literal["inputs", "output"]
@@ -47,13 +47,8 @@ class Likelihood:
     of: Driver = "inputs"
 
     def __post_init__(self) -> None:
-        nu = self.degrees_of_freedom
-        if nu is not None and not nu > 0:
-            raise invalid("degrees_of_freedom", expected="a number > 0", got=repr(nu))
-        if self.inducing < 1:
-            raise invalid("inducing", expected="a whole number >= 1", got=repr(self.inducing))
-        if self.of not in get_args(Driver):
-            raise invalid("of", expected="'inputs' or 'output'", got=repr(self.of))
+        verify_fields(self)
+        one_of(get_args(Driver)).check("of", self.of)
 
     @property
     def gaussian(self) -> bool:
@@ -108,7 +103,7 @@ def Gaussian() -> Likelihood:
 
 def StudentT(degrees_of_freedom: float = 4.0) -> Likelihood:
     """White Student-t measurement noise, for records with outliers."""
-    return Likelihood(degrees_of_freedom=float(degrees_of_freedom))
+    return Likelihood(degrees_of_freedom=POSITIVE.check("degrees_of_freedom", degrees_of_freedom))
 
 
 def Heteroscedastic(inducing: int = 8, of: Driver = "inputs") -> Likelihood:

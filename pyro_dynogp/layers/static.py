@@ -24,7 +24,7 @@ from torch import Tensor
 from pyro_dynogp.layers.functions import JITTER, StaticFunction, even_grid
 from pyro_dynogp.layers.kernels import KernelPrior
 from pyro_dynogp.layers.sites import Site, Values, normal, sample
-from pyro_dynogp.support.errors import invalid, verify
+from pyro_dynogp.support.errors import COUNT, checked, invalid, verify, verify_fields
 from pyro_dynogp.support.tensors import as_tensor
 
 MeanName = Literal["constant", "linear"]
@@ -89,9 +89,7 @@ class StaticPrior:
     locations: Any = None
 
     def __post_init__(self) -> None:
-        verify(channels=self.channels, outputs=self.outputs, inducing=self.inducing)
-        if self.mean not in ("constant", "linear"):
-            raise invalid("mean", expected="'constant' or 'linear'", got=repr(self.mean))
+        verify_fields(self)
 
     @cached_property
     def start(self) -> Tensor:
@@ -185,6 +183,7 @@ def sample_static(
     return prior.function(sample(prior.sites()))
 
 
+@checked
 def static_gp(
     name: str,
     x: Any,
@@ -233,7 +232,7 @@ def static_gp(
     """
     d, e = 1 if channels is None else channels, 1 if outputs is None else outputs
     verify(channels=d, outputs=e)
-    points = as_tensor(x)
+    points = as_tensor(x, argument="x")
     if channels is None:
         points = points.unsqueeze(-1)
     if points.dim() < 2 or points.shape[-1] != d:
@@ -271,7 +270,7 @@ def static_gp(
 
 def _points(argument: str, value: Any, channels: int) -> Tensor:
     """Points (K, d) as a user may write them."""
-    points = as_tensor(value)
+    points = as_tensor(value, argument=argument)
     if points.dim() == 1 and channels == 1:
         points = points.unsqueeze(-1)
     if points.dim() != 2 or points.shape[-1] != channels or not len(points):
@@ -286,7 +285,7 @@ def _support(support: Any, x: Tensor) -> Tensor:
     """Support points (*b, K, d) for points x (*b, n, d)."""
     if not isinstance(support, int):
         return _points("support", support, x.shape[-1])
-    verify(support=support)
+    COUNT.check("support", support)
     x = x.detach()
     if x.shape[-1] > 1:
         index = torch.linspace(0, x.shape[-2] - 1, min(support, x.shape[-2]), dtype=torch.float64)

@@ -60,7 +60,7 @@ class Modes:
     def __post_init__(self) -> None:
         if self.noise not in ("shared", "independent"):
             raise invalid("noise", expected="'shared' or 'independent'", got=repr(self.noise))
-        poles = as_tensor(self.poles, torch.complex128)
+        poles = as_tensor(self.poles, torch.complex128, argument="poles")
         if poles.dim() == 0 or poles.shape[-1] == 0:
             raise invalid(
                 "poles", expected="shape (..., P) with P >= 1", got=f"shape {tuple(poles.shape)}"
@@ -68,7 +68,7 @@ class Modes:
         P = poles.shape[-1]
         if self.output_gain is None:
             raise invalid("output_gain", expected="shape (..., P) or (..., n_y, P)", got="None")
-        c = as_tensor(self.output_gain, torch.complex128, poles.device)
+        c = as_tensor(self.output_gain, torch.complex128, poles.device, argument="output_gain")
         B = self._gain("input_gain", self.input_gain, poles)
         L = self._gain("noise_gain", self.noise_gain, poles)
         if c.dim() == 0 or c.shape[-1] != P or c.dim() > poles.dim() + 1:
@@ -86,7 +86,7 @@ class Modes:
             given = self.feedthrough
             if given.is_complex() if torch.is_tensor(given) else np.iscomplexobj(given):
                 raise invalid("feedthrough", expected="real numbers", got="complex ones")
-            D = as_tensor(self.feedthrough, torch.float64, poles.device)
+            D = as_tensor(self.feedthrough, torch.float64, poles.device, argument="feedthrough")
             if D.shape[D.dim() - len(tail) :] != tail:
                 raise invalid(
                     "feedthrough", expected=f"shape (..., {tail})", got=f"shape {tuple(D.shape)}"
@@ -143,7 +143,7 @@ class Modes:
         P = poles.shape[-1]
         if value is None:
             return torch.zeros(P, 0, dtype=torch.complex128, device=poles.device)
-        gain = as_tensor(value, torch.complex128, poles.device)
+        gain = as_tensor(value, torch.complex128, poles.device, argument=name)
         if gain.dim() < 2 or gain.shape[-2] != P:
             raise invalid(
                 name,

@@ -12,6 +12,7 @@ from pyro_dynogp.lti.modes import NoiseStructure
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.structure import ModelOptions
 from pyro_dynogp.models.wiring import Dynamic, Layer, Static
+from pyro_dynogp.support.errors import verify
 
 
 def LinearDynamicGP(
@@ -78,9 +79,9 @@ def Cascade(
     Raises:
         ValueError: on layers that do not fit together, or unknown options.
     """
-    if any(isinstance(layer, Dynamic) and layer.feedback for layer in layers):
+    if any(getattr(layer, "feedback", ()) for layer in layers or ()):
         options = {"integrate": "all", **options}
-    return Model(inputs, tuple(layers), likelihood or Gaussian(), **options)
+    return Model(inputs, layers, likelihood or Gaussian(), **options)  # type: ignore[arg-type]
 
 
 def Wiener(
@@ -126,6 +127,7 @@ def Hammerstein(
 
     Args: as those of `Wiener`; f has one output for each input.
     """
+    verify(inputs=inputs)
     layers = (
         Static(outputs=max(inputs, 1), inducing=inducing, kernel=kernel),
         Dynamic(outputs=outputs, pairs=pairs, process_noise=process_noise),
@@ -150,6 +152,7 @@ def WienerHammerstein(
     Args: as those of `Wiener`; pairs and process_noise for both dynamic layers or for each; width
         is the number of signals between the layers.
     """
+    verify(width=width)
     first, second = pairs if isinstance(pairs, tuple) else (pairs, pairs)
     noise = process_noise if isinstance(process_noise, tuple) else (process_noise,) * 2
     layers = (
@@ -245,6 +248,7 @@ def HammersteinWiener(
     Args: as those of `Wiener`; inducing for both static layers or for each.
     """
     first, second = inducing if isinstance(inducing, tuple) else (inducing, inducing)
+    verify(inputs=inputs)
     layers = (
         Static(outputs=max(inputs, 1), inducing=first, kernel=kernel),
         Dynamic(outputs=outputs, pairs=pairs, process_noise=process_noise),

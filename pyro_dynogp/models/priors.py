@@ -32,7 +32,7 @@ from pyro_dynogp.distributions.shared_scale import SharedScaleNormal
 from pyro_dynogp.layers.sites import Site, Values, sample
 from pyro_dynogp.lti.modes import Modes, NoiseStructure
 from pyro_dynogp.models.horseshoe import horseshoe, horseshoe_sites
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import instance, invalid, verify_fields
 from pyro_dynogp.support.tensors import joined
 
 PriorName = Literal["default", "paper"]
@@ -66,6 +66,9 @@ class TimeScale:
 
     step: float
     duration: float
+
+    def __post_init__(self) -> None:
+        verify_fields(self)
 
     @classmethod
     def of(cls, scaling: Scaling) -> TimeScale:
@@ -179,8 +182,8 @@ class ModesPrior:
     integrators: int = 0
 
     def __post_init__(self) -> None:
-        if self.priors not in ("default", "paper"):
-            raise invalid("priors", expected="'default' or 'paper'", got=repr(self.priors))
+        verify_fields(self)
+        instance("time_scale", self.time_scale, TimeScale)
         low, high = self.time_scale.rate_bounds
         if high <= low:
             expected = "more than three samples"

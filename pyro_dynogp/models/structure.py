@@ -15,7 +15,7 @@ from pyro_dynogp.layers.noise import Gaussian, Likelihood
 from pyro_dynogp.models.prepared import PreparedRecord, Records
 from pyro_dynogp.models.priors import PriorName
 from pyro_dynogp.models.wiring import INPUTS, Dynamic, Known, Layer, StaticLayer, Wire, wire
-from pyro_dynogp.support.errors import invalid, one_of, verify, whole
+from pyro_dynogp.support.errors import instance, invalid, one_of, verify, whole
 
 Integrate = Literal["none", "last", "all"]
 InitialState = Literal["auto", "site", "integrated", "zero"]
@@ -54,7 +54,15 @@ class Structure:
 
     def __post_init__(self) -> None:
         verify(inputs=self.inputs)
-        object.__setattr__(self, "layers", tuple(self.layers))
+        for name in ("layers", "channels"):
+            given = getattr(self, name)
+            if not isinstance(given, Sequence) or isinstance(given, str):
+                raise invalid(name, expected="a tuple", got=repr(given))
+            object.__setattr__(self, name, tuple(given))
+        for channel in self.channels:
+            instance("channels", channel, Channel)
+        if self.scaling is not None:
+            instance("scaling", self.scaling, Scaling)
         object.__setattr__(self, "channels", tuple(self.channels))
         if not isinstance(self.likelihood, Likelihood):
             raise invalid(
@@ -193,9 +201,9 @@ class Structure:
         Raises:
             ValueError: as of `check`; where they are prepared with another scaling.
         """
-        ready = [] if isinstance(records, Record) else [
-            record for record in records if isinstance(record, PreparedRecord)]  # fmt: skip
-        if not isinstance(records, Record) and ready and len(ready) == len(records):
+        several = records if isinstance(records, Sequence) else ()
+        ready = [record for record in several if isinstance(record, PreparedRecord)]
+        if ready and len(ready) == len(several):
             if any(self.scaling not in (None, record.scaling) for record in ready):
                 expected = "records prepared with the model's scaling"
                 raise invalid("records", expected=expected, got="another scaling")

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from numbers import Real
 
+from pyro_dynogp.layers.kernels import KernelPrior
 from pyro_dynogp.models.layer import Dynamic as Dynamic
 from pyro_dynogp.models.layer import Known as Known
 from pyro_dynogp.models.layer import Layer as Layer
 from pyro_dynogp.models.layer import Limits as Limits
 from pyro_dynogp.models.layer import Static as Static
 from pyro_dynogp.models.layer import StaticLayer as StaticLayer
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import COUNT, RULES, instance, invalid
 
 INPUTS = "inputs"
 
@@ -85,12 +88,13 @@ def wire(inputs: int, layers: Sequence[Layer], output: str | None = None) -> tup
         raise invalid("output", expected=f"one of the layers {names}", got=repr(output))
     _check_feedback(names, layers)
     widths = {name: layer.outputs for name, layer in zip(names, layers, strict=True)}
+    for name, layer in zip(names, layers, strict=True):
+        _check_layer(name, layer)
     back = {source for layer in layers if isinstance(layer, Dynamic) for source in layer.feedback}
     width = {INPUTS: inputs}
     wires: list[Wire] = []
     before: str = INPUTS
     for place, (name, layer) in enumerate(zip(names, layers, strict=True)):
-        _check_layer(name, layer)
         sources = layer.sees or (before, *layer.skip)
         _check_sources(name, layer, width, before)
         channels = sum(width[s] for s in sources)
@@ -136,6 +140,10 @@ def _names(layers: Sequence[Layer]) -> list[str]:
     for layer in layers:
         if not isinstance(layer, Layer):
             raise invalid("layers", expected="Dynamic, Static and Known layers", got=repr(layer))
+        named = layer.name is None or (isinstance(layer.name, str) and layer.name.isidentifier())
+        if not named:
+            expected = "None, or letters, digits and underscores"
+            raise invalid("name of a layer", expected=expected, got=repr(layer.name))
     letters = [_letter(layer) for layer in layers]
     names = []
     for place, (letter, layer) in enumerate(zip(letters, layers, strict=True)):
@@ -172,12 +180,14 @@ def _letter(layer: Layer) -> str:
 
 def _check_feedback(names: Sequence[str], layers: Sequence[Layer]) -> None:
     for place, layer in enumerate(layers):
+        instance(f"skip of layer {names[place]!r}", layer.skip, tuple)
         if not isinstance(layer, Dynamic):
             continue
+        instance(f"feedback of layer {names[place]!r}", layer.feedback, tuple)
         later = [n for n, other in zip(names, layers, strict=True) if _letter(other) == "f"]
         later = [n for n in later if names.index(n) > place]
         given = layer.feedback
-        if isinstance(given, str) or len(set(given)) < len(given) or not set(given) <= set(later):
+        if len(set(given)) < len(given) or not set(given) <= set(later):
             raise invalid(
                 f"feedback of layer {names[place]!r}",
                 expected=f"a tuple of names of later static layers, of {later}",
@@ -203,15 +213,13 @@ def _check_that_all_matter(wires: Sequence[Wire], output: str) -> None:
 
 
 def _check_layer(name: str, layer: Layer) -> None:
-    numbers = {"outputs": layer.outputs}
-    if isinstance(layer, Dynamic):
-        numbers["pairs"] = layer.pairs
-        if layer.noise not in ("shared", "independent"):
-            raise invalid(
-                f"noise of layer {name!r}",
-                expected="'shared' or 'independent'",
-                got=repr(layer.noise),
-            )
+    for option in fields(layer):
+        value = getattr(layer, option.name)
+        if option.name in RULES and not (value is None and option.default is None):
+            RULES[option.name].check(f"{option.name} of layer {name!r}", value)
+    if isinstance(layer, Static):
+        COUNT.check(f"support of layer {name!r}", layer.support)
+        KernelPrior(name, layer.kernel, 1)  # refuses what is no kernel of one function
     elif isinstance(layer, Known):
         low, high = layer.range or (0.0, 1.0)
         if not low < high:
@@ -219,26 +227,14 @@ def _check_layer(name: str, layer: Layer) -> None:
         if not callable(layer.function):
             got = repr(layer.function)
             raise invalid(f"function of layer {name!r}", expected="a function of torch", got=got)
-    else:
-        numbers["inducing"] = layer.inducing
-        numbers["support"] = layer.support
-        if layer.mean not in (None, "constant", "linear"):
-            raise invalid(
-                f"mean of layer {name!r}",
-                expected="'constant' or 'linear'",
-                got=repr(layer.mean),
-            )
-    for argument, value in numbers.items():
-        if not isinstance(value, int) or value < 1:
-            raise invalid(
-                f"{argument} of layer {name!r}", expected="a whole number >= 1", got=repr(value)
-            )
 
 
 def _check_limits(name: str, layer: Static, channels: int, last: bool) -> None:
     assert layer.limits is not None
-    known = [limit for limit in layer.limits if limit is not None]
-    if len(layer.limits) != 2 or not known or known != sorted(set(known)):
+    limits = layer.limits if isinstance(layer.limits, tuple | list) else ()
+    known = [limit for limit in limits if limit is not None]
+    numbers = all(isinstance(limit, Real) and not math.isnan(limit) for limit in known)
+    if len(limits) != 2 or not known or not numbers or known != sorted(set(known)):
         raise invalid(
             f"limits of layer {name!r}",
             expected="(low, high) with low < high; None for one that is not there",

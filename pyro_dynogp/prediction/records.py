@@ -39,6 +39,8 @@ def following(
     Raises:
         ValueError: as `prepared` and `gap_between`.
     """
+    for argument, record in (("past", past), ("future", future)):
+        one_record(record, "Forecast several records one after the other.", argument)
     gap = gap_between(past, future)
     before, after = prepared(fit, past), prepared(fit, future)
     if not fit.model.channels or set(future.input_names) != set(past.input_names):

@@ -10,7 +10,7 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.prediction.mixture_score import mixture_scores
 from pyro_dynogp.prediction.prediction import Prediction
-from pyro_dynogp.support.errors import invalid, whole
+from pyro_dynogp.support.errors import instance, invalid, whole
 
 
 @isolated
@@ -37,6 +37,7 @@ def scores(prediction: Prediction, record: Record, skip: int = 0) -> dict[str, A
     Raises:
         ValueError: where times, outputs or units differ, none is left, or skip is out of range.
     """
+    instance("prediction", prediction, Prediction)
     prediction.check(record)
     skip = whole(0, len(record) - 1).check("skip", skip)
     y = record.outputs

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.records import one_record
 from pyro_dynogp.discrepancy.blocks import blocks_of
 from pyro_dynogp.discrepancy.context import SearchContext, Stopwatch
 from pyro_dynogp.discrepancy.refits import poles_of, quick_fit
@@ -14,6 +15,7 @@ from pyro_dynogp.discrepancy.state import SearchState
 from pyro_dynogp.discrepancy.trials import without
 from pyro_dynogp.effects import CATALOGUE, Effect
 from pyro_dynogp.fitting import fit as fit_model
+from pyro_dynogp.inference.fitted import known_fit
 from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.inference.refit import WARMUP, family_of
 from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
@@ -22,7 +24,7 @@ from pyro_dynogp.models.variants import used_channels
 from pyro_dynogp.report.last_block import report_of
 from pyro_dynogp.report.report import Report
 from pyro_dynogp.statistics.settings import LoopSettings
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import instance, invalid
 from pyro_dynogp.support.parallel import one_thread, parallel_map
 
 if TYPE_CHECKING:
@@ -80,7 +82,14 @@ def close_loop(
     Raises:
         ValueError: on blocks that are too short, unknown candidates, numbers that make no sense.
     """
+    known_fit(fit)
+    one_record(record, "Close the loop on one record.")
     settings = LoopSettings() if settings is None else settings
+    instance("settings", settings, LoopSettings)
+    for effect in effects if isinstance(effects, Sequence) else (effects,):
+        instance("effects", effect, Effect)
+    if not isinstance(candidates, Sequence | Record | None.__class__):
+        raise invalid("candidates", expected="names, or a Record", got=repr(candidates))
     watch = Stopwatch()
     other = candidates if isinstance(candidates, Record) else None
     data = blocks_of(fit, record, other, settings)

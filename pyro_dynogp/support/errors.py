@@ -5,8 +5,9 @@ from __future__ import annotations
 import functools
 import inspect
 import math
+import os
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from numbers import Integral, Real
 from typing import Any, ParamSpec, TypeVar
 
@@ -86,23 +87,57 @@ def one_of(choices: Iterable[str]) -> Rule:
     )
 
 
+def verify_fields(value: object) -> None:
+    """Check the fields of a dataclass that `RULES` names; None passes where it is the default.
+
+    Raises:
+        ValueError: as `verify`.
+    """
+    for field in fields(value):  # type: ignore[arg-type]
+        given = getattr(value, field.name)
+        if field.name in RULES and not (given is None and field.default is None):
+            RULES[field.name].check(field.name, given)
+
+
+def instance(argument: str, value: object, kind: type, advice: str = "") -> None:
+    """Refuse what is not of a class.
+
+    Raises:
+        ValueError: see above.
+    """
+    if not isinstance(value, kind):
+        expected = f"a {kind.__name__}"
+        got = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
+        raise invalid(argument, expected=expected, got=got, advice=advice)
+
+
 SWITCH = Rule(
     "True or False", lambda value: bool(value) if isinstance(value, bool | np.bool_) else None
 )
+PATH = Rule("a path", lambda value: value if isinstance(value, str | os.PathLike) else None)
 COUNT, NUMBER = whole(1), whole(0)
 POSITIVE = between(0.0, math.inf, "a finite number > 0")
+POSITIVE_OR_ZERO = between(-5e-324, math.inf, "a finite number >= 0")
 SHARE = between(0.0, 1.0, "a number between 0 and 1")
 # What an argument of each name has to be, wherever it is one; None is none given where that is the
 # default.
 RULES = {
     **dict.fromkeys(("draws", "samples", "particles", "chains", "warmup", "restarts", "steps",
                      "horizon", "points", "workers", "max_rounds", "tries", "channels", "outputs",
-                     "inducing", "support", "pairs", "brownian"), COUNT),
+                     "inducing", "pairs", "brownian", "count", "width"), COUNT),
     **dict.fromkeys(("prior_samples", "refits", "channel", "inputs", "fed"), NUMBER),
-    **dict.fromkeys(("progress", "process_noise", "feedthrough", "learn_locations"), SWITCH),
+    **dict.fromkeys(("progress", "process_noise", "feedthrough", "learn_locations", "pathwise"),
+                    SWITCH),
     "seed": Rule("a whole number from 0 to 2**63 - 1", whole(0, 2**63 - 1).plain),
     "level": SHARE,
-    "learning_rate": POSITIVE,
+    **dict.fromkeys(("learning_rate", "init_scale", "joint_scale", "gain_scale", "step", "duration",
+                     "degrees_of_freedom"), POSITIVE),
+    **dict.fromkeys(("path", "checkpoint"), PATH),
+    "integrators": Rule("0 or 1", whole(0, 1).plain),
+    "name": Rule("text", lambda value: value if isinstance(value, str) else None),
+    "noise": one_of(("shared", "independent")),
+    "mean": one_of(("constant", "linear")),
+    "priors": one_of(("default", "paper")),
     "folds": whole(2),
     "replicates": whole(2),
 }  # fmt: skip

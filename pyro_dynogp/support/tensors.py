@@ -9,6 +9,8 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from pyro_dynogp.support.errors import invalid
+
 # What users may give as numbers: a tensor, an array, a list, one number.
 Numbers = Tensor | ArrayLike
 
@@ -39,13 +41,25 @@ def joined(parts: Sequence[Tensor], events: int, dim: int) -> Tensor:
 
 
 def as_tensor(
-    value: Numbers, dtype: torch.dtype = torch.float64, device: torch.device | None = None
+    value: Numbers,
+    dtype: torch.dtype = torch.float64,
+    device: torch.device | None = None,
+    *,
+    argument: str = "value",
 ) -> Tensor:
-    """Tensor of the given dtype; read-only arrays (those of a Record) are copied."""
+    """Tensor of the given dtype; read-only arrays (those of a Record) are copied.
+
+    Raises:
+        ValueError: where it holds no numbers; `argument` is what to call it.
+    """
     if isinstance(value, Tensor):
         return value.to(dtype=dtype, device=device or value.device)
     if isinstance(value, np.ndarray) and (
         not value.flags.writeable or min(value.strides, default=0) < 0
     ):
         value = value.copy()
-    return torch.as_tensor(value, dtype=dtype, device=device)
+    try:
+        return torch.as_tensor(value, dtype=dtype, device=device)
+    except (TypeError, ValueError, RuntimeError) as error:
+        got = f"{type(value).__name__} ({error})"
+        raise invalid(argument, expected="an array of numbers", got=got) from error

@@ -277,9 +277,9 @@ class TestErrors:
         assert LayerGuide(model, {"kind": SameAsPrior()})()["kind"].item() in (0.0, 1.0)
 
     def test_scales(self):
-        for family in (MeanField(init_scale=0.0), FullRank(init_scale=-1.0)):
+        for family, scale in ((MeanField, 0.0), (FullRank, -1.0)):
             with pytest.raises(ValueError, match=r"init_scale.*> 0"):
-                LayerGuide(conjugate, default=family)()
+                family(init_scale=scale)
         with pytest.raises(ValueError, match=r"init_sd.*> 0"):
             LayerGuide(Trajectory(), default=GaussMarkov(init_sd=0.0))()
 

@@ -386,7 +386,6 @@ class TestErrors:
             ({"values": {"g": torch.zeros(5)}}, r"'g'.*\(12,\).*\(5,\)"),
             ({"values": {"sigma": -1.0}}, r"'sigma'.*[Gg]reater"),
             ({"families": {"sigma": Point(init=-1.0)}}, "'sigma'"),
-            ({"families": {"sigma": dist.Normal}}, "'sigma'.*a Family.*Normal"),
             ({"default": lambda name, prior: None}, "'decay'.*a Family.*None"),
             ({"values": {"g": torch.full((12,), torch.nan)}}, "'g'"),
         ],
@@ -397,6 +396,8 @@ class TestErrors:
             guide(inputs(), data())
 
     def test_when_made(self):
+        with pytest.raises(ValueError, match=r"'sigma'.*a Family.*Normal"):
+            LayerGuide(models.latent, {"sigma": dist.Normal})
         with pytest.raises(ValueError, match=r"joint.*family.*\['decay'\]"):
             LayerGuide(models.latent, {"decay": Point()}, joint=["decay"])
         with pytest.raises(ValueError, match=r"joint.*several.*'decay'"):

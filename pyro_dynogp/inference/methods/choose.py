@@ -57,6 +57,8 @@ def method_of(
                 got=repr(next(iter(given.values()))),
                 advice=f"Give it to {type(method).__name__}(...).",
             )
+        if isinstance(method, type) or not all(hasattr(method, x) for x in ("check", "__call__")):
+            raise invalid("method", expected="'map', 'svi', 'nuts' or a method", got=repr(method))
         return method
     if method is None:
         method = "svi" if model.has_function or "guide" in given else "map"

@@ -23,7 +23,7 @@ from pyro_dynogp.inference.run import Run
 from pyro_dynogp.layers.sites import Program
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import Records
-from pyro_dynogp.support.errors import verify
+from pyro_dynogp.support.errors import verify, whole
 from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import child_seeds, parallel_map, seeded
 
@@ -59,7 +59,7 @@ class Nuts:
         optimizer: for the starts, as of `Mode`.
 
     Raises:
-        ValueError: on an unknown optimizer, or numbers below one.
+        ValueError: on an unknown optimizer, or numbers below one, or below four for draws.
     """
 
     chains: int = 4
@@ -68,7 +68,8 @@ class Nuts:
     optimizer: Optimizer | None = None
 
     def __post_init__(self) -> None:
-        verify(chains=self.chains, warmup=self.warmup, draws=self.draws)
+        verify(chains=self.chains, warmup=self.warmup)
+        whole(4).check("draws", self.draws)  # fewer make no statistic of a chain
         check_optimizer(self.optimizer)
 
     def check(self, model: Model, *, warm: bool) -> None:

@@ -82,7 +82,7 @@ class Normal:
     def __post_init__(self) -> None:
         if self.family not in ("auto", *get_args(Hyperparameters)):
             raise invalid(
-                "hyperparameters",
+                "family (hyperparameters)",
                 expected="'map', 'normal' or 'multivariate normal'",
                 got=repr(self.family),
             )

@@ -1,0 +1,1 @@
+"""Promises about bad input, surroundings, files and killed processes, and their tests."""
