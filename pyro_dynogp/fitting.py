@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,7 @@ from pyro_dynogp.prediction import predict as _predict
 from pyro_dynogp.prediction.first_state import beginning
 from pyro_dynogp.prediction.layers import LayerTrajectory, StaticBand
 from pyro_dynogp.prediction.prediction import Prediction
+from pyro_dynogp.support.errors import warn
 
 __all__ = ["Fit", "fit", "load"]
 
@@ -233,7 +233,7 @@ def fit(
     problem = Problem.of(model, record, start)
     fitted = Fit.of(train_model(problem, chosen, run, checkpoint))
     for sentence in warnings_of(fitted):
-        warnings.warn(f"fit: {sentence}", stacklevel=2)
+        warn(f"fit: {sentence}")
     return fitted
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pyro_dynogp.lti.covariance import held_gain, state_covariance, step_noise
+from pyro_dynogp.lti.covariance import held_gain, state_covariance, step_noises
 from pyro_dynogp.lti.fused import propagators
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.state import real_propagator
@@ -104,7 +104,7 @@ def discrete_state_space(modes: Modes, step: float) -> DiscreteStateSpace:
         B=torch.cat([drive.real, drive.imag], -2),
         C=torch.cat([2.0 * modes.C.real, -2.0 * modes.C.imag], -1),
         D=modes.D,
-        Q=step_noise(modes, step),
+        Q=step_noises(modes, as_tensor([step]))[..., 0, :, :],
         stationary=state_covariance(modes),
         step=float(step),
     )

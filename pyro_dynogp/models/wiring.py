@@ -259,29 +259,17 @@ def _check_that_all_matter(wires: Sequence[Wire], output: str) -> None:
 
 def _check_layer(name: str, layer: Layer) -> None:
     numbers = {"outputs": layer.outputs}
+    choices: dict[str, tuple[object, ...]]
     if isinstance(layer, Dynamic):
         numbers["pairs"] = layer.pairs
-        if layer.noise not in ("shared", "independent"):
-            raise invalid(
-                f"noise of layer {name!r}",
-                expected="'shared' or 'independent'",
-                got=repr(layer.noise),
-            )
-        if layer.integrators not in (0, 1):
-            raise invalid(
-                f"integrators of layer {name!r}",
-                expected="0, or 1 for one of each output",
-                got=repr(layer.integrators),
-            )
+        choices = {"noise": ("shared", "independent"), "integrators": (0, 1)}
     else:
-        numbers["inducing"] = layer.inducing
-        numbers["support"] = layer.support
-        if layer.mean not in (None, "constant", "linear"):
-            raise invalid(
-                f"mean of layer {name!r}",
-                expected="'constant' or 'linear'",
-                got=repr(layer.mean),
-            )
+        numbers |= {"inducing": layer.inducing, "support": layer.support}
+        choices = {"mean": (None, "constant", "linear")}
+    for argument, allowed in choices.items():
+        if getattr(layer, argument) not in allowed:
+            expected, got = " or ".join(map(repr, allowed)), repr(getattr(layer, argument))
+            raise invalid(f"{argument} of layer {name!r}", expected=expected, got=got)
     for argument, value in numbers.items():
         if not isinstance(value, int) or value < 1:
             raise invalid(

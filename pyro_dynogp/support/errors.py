@@ -1,6 +1,9 @@
-"""One form for the errors that a user can cause: what is wrong, with which argument, what to do."""
+"""One form for the errors that a user can cause, and for warnings: at the user's own line."""
 
 from __future__ import annotations
+
+import inspect
+import warnings
 
 
 def invalid(argument: str, *, expected: str, got: str, advice: str = "") -> ValueError:
@@ -17,3 +20,11 @@ def invalid(argument: str, *, expected: str, got: str, advice: str = "") -> Valu
     """
     message = f"{argument}: expected {expected}, got {got}."
     return ValueError(f"{message} {advice}" if advice else message)
+
+
+def warn(message: str) -> None:
+    """Warn of the line that called the package."""
+    frame, level = inspect.currentframe(), 1
+    while frame is not None and str(frame.f_globals.get("__name__")).startswith("pyro_dynogp"):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, stacklevel=level)

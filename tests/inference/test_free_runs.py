@@ -96,3 +96,14 @@ def test_a_fit_runs_better_than_the_linear_model():
     )
     errors = [free_run_error(f.model.collapsed, f.mode, f.model.prepare(record)) for f in fits]
     assert errors[0] < 0.7 * errors[1]
+
+
+def test_the_warning_is_of_the_line_that_called(monkeypatch):
+    monkeypatch.setattr(mode, "free_run_error", lambda model, *_: 1.0 + model.has_function)
+    with pytest.warns(UserWarning, match="no better than") as caught:
+        dgp.fit(
+            dgp.Wiener(1, pairs=1), bent(60), method="map", restarts=1, steps=2, workers=1,
+            progress=False,
+        )  # fmt: skip
+    said = [one for one in caught if "no better" in str(one.message)]
+    assert [one.filename for one in said] == [__file__]

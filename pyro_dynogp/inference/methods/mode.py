@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -19,20 +18,20 @@ from pyro_dynogp.inference.optimise.gauss_newton import has_innovations
 from pyro_dynogp.inference.optimise.maximum import EFFORT, Effort, Optimizer, Optimum, maximise
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.run import Run
-from pyro_dynogp.inference.starts.linear import (
+from pyro_dynogp.inference.starts.plans import (
     RANDOM,
+    Values,
     linear_starts,
     linear_twins,
     optimizer_for,
     spread,
 )
-from pyro_dynogp.inference.starts.plans import Values
 from pyro_dynogp.inference.starts.poles import grown
 from pyro_dynogp.layers.noise import TYPICAL
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import Records, as_measured
 from pyro_dynogp.models.variants import without_noise_below_functions
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import invalid, warn
 from pyro_dynogp.support.frozen import FrozenMapping
 
 # Most iterations of linear fits by each optimizer.
@@ -171,7 +170,7 @@ def cascade_optima(problem: Problem, run: Run, optimizer: Optimizer, steps: int)
         holding = [one for one in optima if free_run_error(model, one.values, records) <= least]
         if holding:
             return holding
-    warnings.warn(NO_BETTER, stacklevel=2)
+    warn(NO_BETTER)
     return optima
 
 
