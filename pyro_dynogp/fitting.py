@@ -198,7 +198,9 @@ def fit(
     climbed from several starts, in parallel. `Mode` ("map") keeps the best optimum; `Normal`
     ("svi") fits normals to the posterior around the best optima; `Nuts` ("nuts") samples it. The
     starts of a cascade are the best linear fits, spread over its layers; where static layers see
-    process noise they climb without any first, and the better half continues with it. With
+    process noise they climb without any first, and the better half continues with it. Free runs
+    through the training record decide whether it stays, and leave out optima that run worse than
+    the linear model (docs/structures.md). With
     `Trajectories` trajectories stay sample sites, and Pyro's SVI fits them and the parameters
     together.
 
