@@ -34,14 +34,16 @@ def _slow(fit: Fitted) -> list[str]:
         pole = max(layer.modes.poles[: made.pairs].tolist(), key=lambda pole: pole.real)
         held = -pole.real * duration
         if held < FEWEST:
-            kind, advice = "all but integrates", "Set integrators=1 if the plant integrates"
+            kind, advice = "all but integrates", "set integrators=1 if the plant integrates, "
             if abs(pole.imag) > 2.0 * abs(pole.real):
-                kind, advice = "goes on oscillating", "Add a Sinusoid for oscillations from outside"
+                kind, advice = "oscillates on", "add a Sinusoid for what oscillates outside, "
+            elif made.integrators:
+                advice = ""
             found.append(
                 f"layer {wire.name}: the pole with natural frequency {abs(pole):.4g} rad/{unit} "
                 f"decays so slowly that the record holds only {held:.1f} of its time constants. "
-                f"Within this record it {kind}, and forecasts with it are not to be trusted. "
-                f"{advice}, remove what drifts, take a longer record, or fewer pairs."
+                f"Within this record it {kind}, and forecasts with it are not to be trusted: "
+                f"{advice}remove what drifts, take a longer record, or fewer pairs."
             )
     return found
 

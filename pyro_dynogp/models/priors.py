@@ -236,15 +236,7 @@ class ModesPrior:
         D = values.get(f"{name}_feedthrough")
         if D is not None and self.fed:
             D = torch.nn.functional.pad(D, (0, self.fed))
-        return Modes(
-            poles=poles,
-            input_gain=B,
-            output_gain=c,
-            noise_gain=L,
-            feedthrough=D,
-            noise=self.noise,
-            drift=drift,
-        )
+        return Modes(poles, B, c, L, D, noise=self.noise, drift=drift)
 
     def _with_integrators(
         self, values: Values, poles: Tensor, B: Tensor | None, c: Tensor, L: Tensor | None
