@@ -268,7 +268,8 @@ def _check_layer(name: str, layer: Layer) -> None:
         choices = {"mean": (None, "constant", "linear")}
     for argument, allowed in choices.items():
         if getattr(layer, argument) not in allowed:
-            expected, got = " or ".join(map(repr, allowed)), repr(getattr(layer, argument))
+            expected = " or ".join(repr(choice) for choice in allowed if choice is not None)
+            got = repr(getattr(layer, argument))
             raise invalid(f"{argument} of layer {name!r}", expected=expected, got=got)
     for argument, value in numbers.items():
         if not isinstance(value, int) or value < 1:
