@@ -20,7 +20,7 @@ def bent():
 @pytest.fixture(scope="session")
 def collapsed_fit(bent):
     """By the collapsed guide: inducing values and first states normal, all else at its optimum."""
-    return dgp.fit(wiener(process_noise=False), bent, **COLLAPSED)
+    return dgp.fit(wiener(), bent, **COLLAPSED)
 
 
 @pytest.fixture(scope="session")

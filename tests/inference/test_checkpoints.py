@@ -109,8 +109,7 @@ from tests.inference.cascades import wiener, wiener_record
 
 svi.CHUNK = {chunk}
 if __name__ == "__main__":
-    model = wiener(process_noise={noise})
-    dgp.fit(model, wiener_record(), checkpoint={folder!r}, **conftest.{options})
+    dgp.fit(wiener(), wiener_record(), checkpoint={folder!r}, **conftest.{options})
 """
 
 
@@ -148,21 +147,19 @@ def test_a_killed_fit_goes_on_to_the_same_bits(
     """Parameters, state of Adam and random numbers are put back, and nothing is done twice."""
     whole = request.getfixturevalue(name)  # in one go, in pieces of 50 steps
     awaited = f"{piece.format(chunk)}.safetensors"
-    noise = options == "LAYERED"
-    model = wiener(process_noise=noise)
-    kill_when_there_is(tmp_path / awaited, tmp_path, options=options, chunk=chunk, noise=noise)
+    kill_when_there_is(tmp_path / awaited, tmp_path, options=options, chunk=chunk)
     before = stamps(tmp_path)
     assert awaited in before
     monkeypatch.setattr(svi, "CHUNK", chunk)
     settings = COLLAPSED if options == "COLLAPSED" else LAYERED
-    resumed = dgp.fit(model, bent, checkpoint=tmp_path, **settings)
+    resumed = dgp.fit(wiener(), bent, checkpoint=tmp_path, **settings)
     assert same(resumed, whole)
     after = stamps(tmp_path)
     assert {k: after[k] for k in before} == before  # read, not computed again
     # The kill may come a moment late, but at most the pieces after the one awaited are new.
     names = [piece.format(step) for step in rest] + ["start-0-result"]
     assert set(after) - set(before) <= {f"{one}.safetensors" for one in names}
-    again = dgp.fit(model, bent, checkpoint=tmp_path, **settings)
+    again = dgp.fit(wiener(), bent, checkpoint=tmp_path, **settings)
     assert same(again, whole)
     assert stamps(tmp_path) == after
 
