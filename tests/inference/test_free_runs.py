@@ -66,15 +66,17 @@ def test_a_model_without_functions_is_not_judged(monkeypatch):
 @pytest.mark.parametrize(
     ("model", "with_noise", "pays"),
     [
-        (dgp.Wiener(1), 1.24, True),
-        (dgp.Wiener(1), 1.26, False),
+        (dgp.Wiener(1), 1.49, True),
+        (dgp.Wiener(1), 1.51, False),
         (dgp.NonlinearFeedback(1), 0.98, True),
         (dgp.NonlinearFeedback(1), 1.0, False),
     ],
 )
 def test_what_process_noise_may_cost(monkeypatch, model, with_noise, pays):
     monkeypatch.setattr(free_runs, "free_run_error", lambda model, values, records: values)
-    assert noise_pays(model, [], optimum(0.0, with_noise), optimum(0.0, 1.0)) == pays
+    assert noise_pays(model, [], optimum(0.0, with_noise), optimum(0.0, 1.0), 1.5) == pays
+    if not model.has_feedback:  # nor has it to run better than both
+        assert noise_pays(model, [], optimum(0.0, 1.0), optimum(0.0, 1.0), 0.5)
 
 
 def bent(n=240):
