@@ -25,6 +25,7 @@ if TYPE_CHECKING:  # the same names, for editors and type checkers; a test compa
     )
     from pyro_dynogp.data.record import Record as Record
     from pyro_dynogp.data.scaling import Scaling as Scaling
+    from pyro_dynogp.data.scaling import TimeScale as TimeScale
     from pyro_dynogp.distributions.process import LTIProcess as LTIProcess
     from pyro_dynogp.distributions.reparam import InnovationReparam as InnovationReparam
     from pyro_dynogp.examples import datasets as datasets
@@ -63,7 +64,6 @@ if TYPE_CHECKING:  # the same names, for editors and type checkers; a test compa
     from pyro_dynogp.models.layer import Known as Known
     from pyro_dynogp.models.layer import Static as Static
     from pyro_dynogp.models.model import Model as Model
-    from pyro_dynogp.models.priors import TimeScale as TimeScale
     from pyro_dynogp.models.priors import sample_modes as sample_modes
     from pyro_dynogp.prediction.prediction import Prediction as Prediction
     from pyro_dynogp.prediction.scores import scores as scores
@@ -102,7 +102,7 @@ HOMES = {
     "Gaussian": "layers.noise",
     "StudentT": "layers.noise",
     "Heteroscedastic": "layers.noise",
-    "TimeScale": "models.priors",
+    "TimeScale": "data.scaling",
     # Criticism of a fit, and the loop that extends its model.
     "loo": "criticism.loo",
     "compare": "criticism.comparison",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,7 @@ from pyro_dynogp.prediction import predict as _predict
 from pyro_dynogp.prediction.first_state import beginning
 from pyro_dynogp.prediction.layers import LayerTrajectory, StaticBand
 from pyro_dynogp.prediction.prediction import Prediction
-from pyro_dynogp.support.errors import instance
+from pyro_dynogp.support.errors import instance, warn
 
 __all__ = ["Fit", "fit", "load"]
 
@@ -212,7 +211,9 @@ def fit(
     climbed from several starts, in parallel. `Mode` ("map") keeps the best optimum; `Normal`
     ("svi") fits normals to the posterior around the best optima; `Nuts` ("nuts") samples it. The
     starts of a cascade are the best linear fits, spread over its layers; where static layers see
-    process noise they climb without any first, and the better half continues with it. With
+    process noise they climb without any first, and the better half continues with it. Free runs
+    through the training record decide whether it stays, and leave out optima that run worse than
+    the linear model (docs/structures.md). With
     `Trajectories` trajectories stay sample sites, and Pyro's SVI fits them and the parameters
     together.
 
@@ -250,7 +251,7 @@ def fit(
     problem = Problem.of(model, record, start)
     fitted = Fit.of(train_model(problem, chosen, run, checkpoint))
     for sentence in warnings_of(fitted):
-        warnings.warn(f"fit: {sentence}", stacklevel=2)
+        warn(f"fit: {sentence}")
     return fitted
 
 

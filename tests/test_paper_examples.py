@@ -8,8 +8,8 @@ import pytest
 import torch
 
 import pyro_dynogp as dgp
-from pyro_dynogp.lti.views import matern32
 from tests.benchmarks.example2 import identify
+from tests.lti.matern import matern32
 
 
 def test_example_1_matern_process_as_a_linear_system():

@@ -14,8 +14,8 @@ from torch import Tensor
 from pyro_dynogp.criticism.labelled import Variable, ratio_units, units_of
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.lti.modes import Modes
+from pyro_dynogp.lti.views import numerators
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.priors import numerators
 from pyro_dynogp.models.system import System
 from pyro_dynogp.models.wiring import Dynamic, Wire
 from pyro_dynogp.support.tensors import as_tensor

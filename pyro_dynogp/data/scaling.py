@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 from pyro_dynogp.data.checks import Array
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.records import as_records
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import invalid, verify_fields
 
 _ARRAYS = ("input_offset", "input_scale", "output_offset", "output_scale")
 _NAMES = ("input_names", "output_names", "input_units", "output_units")
@@ -172,6 +173,37 @@ class Scaling:
 
     def __hash__(self) -> int:
         return hash((self.time_step, self.duration, self.input_names, self.output_names))
+
+
+@dataclass(frozen=True)
+class TimeScale:
+    """What the record says about time constants.
+
+    Attributes:
+        step: median sampling step [s].
+        duration: length of the record [s].
+    """
+
+    step: float
+    duration: float
+
+    def __post_init__(self) -> None:
+        verify_fields(self)
+
+    @classmethod
+    def of(cls, scaling: Scaling) -> TimeScale:
+        """Step and duration of the training record(s)."""
+        return cls(float(scaling.time_step), float(scaling.duration))
+
+    @property
+    def rate_bounds(self) -> tuple[float, float]:
+        """Logarithms of the slowest and fastest rates [1/s] that the record can show."""
+        return math.log(1.0 / self.duration), math.log(math.pi / self.step)
+
+    @property
+    def typical_rate(self) -> float:
+        """Geometric mean [1/s] of the slowest and fastest rates."""
+        return math.exp(0.5 * sum(self.rate_bounds))
 
 
 def _statistics(role: str, arrays: list[Array], names: tuple[str, ...]) -> tuple[Array, Array]:

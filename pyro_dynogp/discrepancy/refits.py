@@ -18,7 +18,7 @@ from pyro_dynogp.inference.optimise.maximum import Effort, Optimum, maximise
 from pyro_dynogp.inference.optimise.side_by_side import each_in_lockstep
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.dynamic import Values
-from pyro_dynogp.inference.starts.linear import starting_points
+from pyro_dynogp.inference.starts.plans import starting_points
 from pyro_dynogp.inference.starts.poles import (
     grown,
     random_poles,

@@ -211,19 +211,7 @@ def simulate_wiener(
     u[k], that is, the output stamped t_k belongs to t_k + step; here it belongs to t_k.
     Inputs, initial state and test part as in `simulate_lti`.
 
-    Args:
-        seed: of system and noise; the same seed gives the same bits.
-        samples: number of samples n.
-        training_samples: number of those in the training record.
-        sampling_time: step [s].
-        noise_ratio: measurement noise's standard deviation over that of the clean output
-            (over all n samples).
-
-    Returns:
-        Records and truth.
-
-    Raises:
-        ValueError: a number out of its range.
+    Arguments, result and errors are those of `simulate_lti`.
     """
     setting = _setting(seed, samples, training_samples, sampling_time, noise_ratio)
     system, inputs = setting.system, setting.inputs

@@ -21,10 +21,9 @@ from pyro_dynogp.moments.stepping import step_through
 
 # Blocks of a record at most, and segments of the filter in one at least.
 BLOCKS, LEAST = 8, 2
-# What is left of noise gains that are switched off. The share of the error that noise has to take
-# away with feedback, to pay, and that it may add without: free runs of a fit without noise are the
-# closest to the training record that there are, also where the plant has noise.
-SILENT, WORTH, SPARED = 1e-3, 0.01, 0.25
+# What is left of noise gains that are switched off, and the share of the error that noise has to
+# take away to pay, with feedback.
+SILENT, WORTH = 1e-3, 0.01
 
 
 def free_run_error(
@@ -91,11 +90,15 @@ def silenced(
 
 
 def noise_pays(
-    model: Model, records: Sequence[PreparedRecord], noisy: Optimum, quiet: Optimum
+    model: Model, records: Sequence[PreparedRecord], noisy: Optimum, quiet: Optimum, line: float
 ) -> bool:
     """Whether free runs over blocks are good enough with process noise, beside those without.
 
-    Better by a hundredth with feedback; in forward cascades not worse by more than a quarter.
+    With feedback better by a hundredth. In forward cascades no worse than without, or than those of
+    the linear model, whose error is `line`: free runs of a fit without noise are the closest to the
+    training record that there are, also where the plant has noise.
     """
     with_noise, without = (free_run_error(model, one.values, records) for one in (noisy, quiet))
-    return with_noise < (1.0 - WORTH if model.has_feedback else 1.0 + SPARED) * without
+    if model.has_feedback:
+        return with_noise < (1.0 - WORTH) * without
+    return with_noise <= max(without, line)

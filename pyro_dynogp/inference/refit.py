@@ -18,7 +18,7 @@ from pyro_dynogp.inference.methods.svi import Schedule
 from pyro_dynogp.inference.optimise.maximum import Effort, Optimum, maximise
 from pyro_dynogp.inference.posteriors import Mixture, Sampled, draws_of_guide
 from pyro_dynogp.inference.run import Run
-from pyro_dynogp.inference.starts.linear import optimizer_for
+from pyro_dynogp.inference.starts.plans import optimizer_for
 from pyro_dynogp.models.prepared import as_measured
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping

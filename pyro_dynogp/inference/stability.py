@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from pyro_dynogp.inference.fitted import Fitted
-from pyro_dynogp.statistics.growth import growth
+from pyro_dynogp.statistics.growth import least_stable_pole
 
+# A plant is unstable where a pole multiplies its state by exp(GROWTH) within the record and lies
+# SURE standard errors beyond the boundary of stability.
+GROWTH, SURE = 3.0, 3.0
 # A pole is slow where the record holds fewer of its time constants than this. The prior of decay
 # rates (`LogDecayRate`) has its mode at twenty, and below three keeps it from going lower by nearly
 # three nats for each factor e: only a record that pulls towards zero gets there.
@@ -18,28 +21,29 @@ def warnings_of(fit: Fitted) -> tuple[str, ...]:
     return tuple(_unstable(fit) or _slow(fit))
 
 
+def is_unstable(rate: float, error: float, duration: float) -> bool:
+    """Whether a pole of a rate, known to a standard error, is unstable and matters."""
+    return rate * duration > GROWTH and rate > SURE * error
+
+
 def _slow(fit: Fitted) -> list[str]:
     """Of the slowest pole of each dynamic layer."""
     unit, duration = fit.scaling.time_unit, float(fit.scaling.duration)
-    found = []
-    system = fit.system_at(fit.mode)
-    for (wire, layer), (_, made) in zip(system.dynamic, fit.model.dynamic, strict=True):
-        pairs = layer.modes.poles[: made.pairs].tolist()
-        pole = max(pairs, key=lambda pole: pole.real)
+    found, layers = [], fit.system_at(fit.mode).dynamic
+    for (wire, layer), (_, made) in zip(layers, fit.model.dynamic, strict=True):
+        pole = max(layer.modes.poles[: made.pairs].tolist(), key=lambda pole: pole.real)
         held = -pole.real * duration
         if held < FEWEST:
-            lasts = abs(pole.imag) > 2.0 * abs(pole.real)
+            kind, advice = "all but integrates", "set integrators=1 if the plant integrates, "
+            if abs(pole.imag) > 2.0 * abs(pole.real):
+                kind, advice = "oscillates on", "add a Sinusoid for what oscillates outside, "
+            elif made.integrators:
+                advice = ""
             found.append(
                 f"layer {wire.name}: the pole with natural frequency {abs(pole):.4g} rad/{unit} "
                 f"decays so slowly that the record holds only {held:.1f} of its time constants. "
-                f"Within this record it {'goes on oscillating' if lasts else 'all but integrates'}"
-                ", and forecasts with it are not to be trusted. "
-                + (
-                    "Add a Sinusoid channel if something outside oscillates, "
-                    if lasts
-                    else "Set integrators=1 if the plant integrates, remove what drifts beside it, "
-                )
-                + "take a longer record, or fewer pairs."
+                f"Within this record it {kind}, and forecasts with it are not to be trusted: "
+                f"{advice}remove what drifts, take a longer record, or fewer pairs."
             )
     return found
 
@@ -52,13 +56,13 @@ def _unstable(fit: Fitted) -> list[str]:
         return []
     found = []
     for index, name in enumerate(fit.scaling.output_names):
-        grows = growth([r.inputs for r in records], [r.outputs[:, index] for r in records])
-        if grows is not None and grows.unstable:
-            rate, error = grows.rate / step, grows.error / step
+        outputs = [record.outputs[:, index] for record in records]
+        pole = least_stable_pole([record.inputs for record in records], outputs) or (0.0, 1.0)
+        rate, error = (x / step for x in pole)
+        if is_unstable(rate, error, float(fit.scaling.duration)):
             found.append(
                 f"output {name!r}: the record is that of an unstable plant (an autoregression has "
                 f"a pole at {rate:.3g} +- {error:.1g} 1/{unit}), and only stable systems can be "
-                "identified. Identify the closed loop, which is stable: take its reference as the "
-                "input."
+                "identified. The closed loop is stable: take its reference as the input."
             )
     return found

@@ -69,17 +69,16 @@ def held_gain(poles: Tensor, step: Tensor | float) -> Tensor:
     return torch.where(poles == 0, step, gain)
 
 
-def step_noise(modes: Modes, step: float) -> Tensor:
-    """Covariance (*b, 2P, 2P) that process noise adds to [Re x; Im x] within a step [s].
+def step_noises(modes: Modes, steps: Tensor) -> Tensor:
+    """Covariance (*b, m, 2P, 2P) that process noise adds to [Re x; Im x] within each step (m,) [s].
 
     Equal to P - Phi P Phi' for the stationary P, without its cancellation at short steps.
     """
     lam = modes.poles
-    hermitian, symmetric = modal_covariance(modes)
+    hermitian, symmetric = (x.unsqueeze(-3) for x in modal_covariance(modes))
     sums = lam.unsqueeze(-1) + lam.conj().unsqueeze(-2), lam.unsqueeze(-1) + lam.unsqueeze(-2)
-    return real_covariance(
-        -hermitian * complex_expm1(sums[0] * step), -symmetric * complex_expm1(sums[1] * step)
-    )
+    decays = (complex_expm1(x.unsqueeze(-3) * steps[:, None, None]) for x in sums)
+    return real_covariance(-hermitian * next(decays), -symmetric * next(decays))
 
 
 def state_covariance(modes: Modes) -> Tensor:

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pyro_dynogp.lti.covariance import held_gain, state_covariance, step_noise
+from pyro_dynogp.lti.covariance import held_gain, state_covariance, step_noises
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.tensors import as_tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,4 +76,5 @@ def propagate(
     if state.covariance is None:
         return ModalState(mean, state_covariance(modes))
     F = real_propagator(phi)
-    return ModalState(mean, F @ state.covariance @ F.mT + step_noise(modes, step))
+    noise = step_noises(modes, as_tensor([step]))[..., 0, :, :]
+    return ModalState(mean, F @ state.covariance @ F.mT + noise)

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pyro_dynogp.lti.covariance import held_gain, state_covariance, step_noise
+from pyro_dynogp.lti.covariance import held_gain, state_covariance, step_noises
 from pyro_dynogp.lti.fused import propagators
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.state import real_propagator
@@ -104,7 +104,7 @@ def discrete_state_space(modes: Modes, step: float) -> DiscreteStateSpace:
         B=torch.cat([drive.real, drive.imag], -2),
         C=torch.cat([2.0 * modes.C.real, -2.0 * modes.C.imag], -1),
         D=modes.D,
-        Q=step_noise(modes, step),
+        Q=step_noises(modes, as_tensor([step]))[..., 0, :, :],
         stationary=state_covariance(modes),
         step=float(step),
     )
@@ -177,29 +177,22 @@ def steady_state_gain(modes: Modes) -> Tensor:
     return frequency_response(modes, torch.zeros(1, dtype=torch.float64))[..., 0, :, :].real
 
 
-def matern32(lengthscale: float, sd: float = 1.0, *, split: float = 1e-4) -> Modes:
-    """Build one pair with the covariance of a Matern-3/2 process (the paper's Example 1).
-
-    The Matern-3/2 process has a double real pole at -a, a = sqrt(3)/lengthscale, which no
-    diagonal system has exactly. This pair sits at -a +- i split a; its normalised covariance
-    differs from exp(-a tau) (1 + a tau) by less than split^2 + 1e-15/split^2, the second part
-    being rounding: 1e-4 is near the best.
+def residues(poles: Tensor, numerator: Tensor) -> Tensor:
+    """Residue at each pole of (b1 s + b0) / ((s - lambda)(s - conj lambda)).
 
     Args:
-        lengthscale: l [s]. sd: standard deviation of the process [output].
-        split: imaginary part of the poles relative to a; the gains grow as 1/split.
+        poles: (*b, P). numerator: (*b, P, n, 2), b1 and b0 last, real.
 
     Returns:
-        White noise of intensity 12 sqrt(3)/l^3 sd^2 through 1/(s + a)^2, nearly. (Example 1 prints
-        36/l^3, with which the variance is sqrt(3) sd^2.)
+        (*b, P, n), complex: B with B/(s - lambda) + conj = the section.
     """
-    a = 3.0**0.5 / lengthscale
-    omega = split * a
-    # c L exp(lambda t) + conjugate = q exp(-a t) sin(omega t)/omega, the smooth double-pole filter;
-    # q makes the stationary variance q^2 / (4 a (a^2 + omega^2)) equal to sd^2.
-    q = sd * (4.0 * a * (a * a + omega * omega)) ** 0.5
-    return Modes(
-        poles=torch.tensor([complex(-a, omega)], dtype=torch.complex128),
-        output_gain=torch.tensor([complex(0.0, -0.5 * q / omega)], dtype=torch.complex128),
-        noise_gain=torch.ones(1, 1, dtype=torch.complex128),
-    )
+    lam = poles.unsqueeze(-1)
+    b1, b0 = numerator[..., 0], numerator[..., 1]
+    real = 0.5 * b1
+    return torch.complex(real, -(0.5 * b0 + real * lam.real) / lam.imag)
+
+
+def numerators(poles: Tensor, residue: Tensor) -> Tensor:
+    """Inverse of `residues`: b1 and b0 (*b, P, n, 2)."""
+    b0 = -2.0 * (residue * poles.unsqueeze(-1).conj()).real
+    return torch.stack([2.0 * residue.real, b0], -1)

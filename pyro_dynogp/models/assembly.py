@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.layers.functions import StaticFunction
-from pyro_dynogp.lti.covariance import complex_expm1, modal_covariance, real_covariance
+from pyro_dynogp.lti.covariance import step_noises
 from pyro_dynogp.lti.fused import propagators
 from pyro_dynogp.lti.grid import TimeGrid
 from pyro_dynogp.lti.modes import Modes
@@ -315,16 +315,3 @@ def assemble(
         else:
             walk.signals[place.name] = walk.static(place, layer)
     return walk.finish(system.noise_sd(inputs, grid) if noise_sd is None else noise_sd)
-
-
-def step_noises(modes: Modes, steps: Tensor) -> Tensor:
-    """Covariance (*b, m, 2P, 2P) that process noise adds to [Re x; Im x] within each step."""
-    lam = modes.poles
-    hermitian, symmetric = modal_covariance(modes)
-    d = steps[:, None, None]
-    plus = (lam.unsqueeze(-1) + lam.conj().unsqueeze(-2)).unsqueeze(-3)
-    same = (lam.unsqueeze(-1) + lam.unsqueeze(-2)).unsqueeze(-3)
-    return real_covariance(
-        -hermitian.unsqueeze(-3) * complex_expm1(plus * d),
-        -symmetric.unsqueeze(-3) * complex_expm1(same * d),
-    )

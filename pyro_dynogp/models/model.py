@@ -11,7 +11,7 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from pyro_dynogp.data.scaling import Scaling
+from pyro_dynogp.data.scaling import Scaling, TimeScale
 from pyro_dynogp.layers.functions import StaticFunction, support_points
 from pyro_dynogp.layers.sites import Site, Values, sample
 from pyro_dynogp.layers.static import StaticPrior
@@ -21,7 +21,7 @@ from pyro_dynogp.models.limits import at_limits, log_probability_scale, scaled_l
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.past_inputs import past_input_covariance
 from pyro_dynogp.models.prepared import Records
-from pyro_dynogp.models.priors import FLAT, ModesPrior, TimeScale, direct_site
+from pyro_dynogp.models.priors import FLAT, ModesPrior, direct_site
 from pyro_dynogp.models.structure import Structure
 from pyro_dynogp.models.system import DynamicSystem, StaticSystem, System
 from pyro_dynogp.models.wiring import Dynamic, Known, Static, Wire

@@ -26,11 +26,12 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from pyro_dynogp.data.scaling import Scaling
+from pyro_dynogp.data.scaling import TimeScale
 from pyro_dynogp.distributions.decay import LogDecayRate
 from pyro_dynogp.distributions.shared_scale import SharedScaleNormal
 from pyro_dynogp.layers.sites import Site, Values, sample
 from pyro_dynogp.lti.modes import Modes, NoiseStructure
+from pyro_dynogp.lti.views import residues
 from pyro_dynogp.models.horseshoe import horseshoe, horseshoe_sites
 from pyro_dynogp.support.errors import instance, invalid, verify_fields
 from pyro_dynogp.support.tensors import joined
@@ -52,38 +53,9 @@ WALK, WALKED = 0.01, 0.1
 # What is left of new noise gains where a model is extended: not nothing, since at zero the density
 # has no slope.
 QUIET = 0.05
+# Time counted in samples of a record of 1000.
+OF_SAMPLES = TimeScale(1.0, 1000.0)
 NO_NAMES: Mapping[str, str] = MappingProxyType({})
-
-
-@dataclass(frozen=True)
-class TimeScale:
-    """What the record says about time constants.
-
-    Attributes:
-        step: median sampling step [s].
-        duration: length of the record [s].
-    """
-
-    step: float
-    duration: float
-
-    def __post_init__(self) -> None:
-        verify_fields(self)
-
-    @classmethod
-    def of(cls, scaling: Scaling) -> TimeScale:
-        """Step and duration of the training record(s)."""
-        return cls(float(scaling.time_step), float(scaling.duration))
-
-    @property
-    def rate_bounds(self) -> tuple[float, float]:
-        """Logarithms of the slowest and fastest rates [1/s] that the record can show."""
-        return math.log(1.0 / self.duration), math.log(math.pi / self.step)
-
-    @property
-    def typical_rate(self) -> float:
-        """Geometric mean [1/s] of the slowest and fastest rates."""
-        return math.exp(0.5 * sum(self.rate_bounds))
 
 
 def _normal(scale: float, *shape: int) -> dist.Distribution:
@@ -93,27 +65,6 @@ def _normal(scale: float, *shape: int) -> dist.Distribution:
 
 def _complex(x: Tensor) -> Tensor:
     return torch.complex(x[..., 0], x[..., 1])
-
-
-def residues(poles: Tensor, numerator: Tensor) -> Tensor:
-    """Residue at each pole of (b1 s + b0) / ((s - lambda)(s - conj lambda)).
-
-    Args:
-        poles: (*b, P). numerator: (*b, P, n, 2), b1 and b0 last, real.
-
-    Returns:
-        (*b, P, n), complex: B with B/(s - lambda) + conj = the section.
-    """
-    lam = poles.unsqueeze(-1)
-    b1, b0 = numerator[..., 0], numerator[..., 1]
-    real = 0.5 * b1
-    return torch.complex(real, -(0.5 * b0 + real * lam.real) / lam.imag)
-
-
-def numerators(poles: Tensor, residue: Tensor) -> Tensor:
-    """Inverse of `residues`: b1 and b0 (*b, P, n, 2)."""
-    b0 = -2.0 * (residue * poles.unsqueeze(-1).conj()).real
-    return torch.stack([2.0 * residue.real, b0], -1)
 
 
 @dataclass(frozen=True)
@@ -175,7 +126,7 @@ class ModesPrior:
     noise: NoiseStructure = "shared"
     feedthrough: bool = True
     process_noise: bool = True
-    time_scale: TimeScale = TimeScale(1.0, 1000.0)
+    time_scale: TimeScale = OF_SAMPLES
     gain_scale: float = GAIN_SCALE
     priors: PriorName = "default"
     fed: int = 0
@@ -285,15 +236,7 @@ class ModesPrior:
         D = values.get(f"{name}_feedthrough")
         if D is not None and self.fed:
             D = torch.nn.functional.pad(D, (0, self.fed))
-        return Modes(
-            poles=poles,
-            input_gain=B,
-            output_gain=c,
-            noise_gain=L,
-            feedthrough=D,
-            noise=self.noise,
-            drift=drift,
-        )
+        return Modes(poles, B, c, L, D, noise=self.noise, drift=drift)
 
     def _with_integrators(
         self, values: Values, poles: Tensor, B: Tensor | None, c: Tensor, L: Tensor | None
@@ -347,7 +290,7 @@ def sample_modes(
     """
     prior = ModesPrior(
         name, inputs, pairs, outputs, brownian, noise, feedthrough, process_noise,
-        time_scale or TimeScale(1.0, 1000.0), gain_scale, priors,
+        time_scale or OF_SAMPLES, gain_scale, priors,
     )  # fmt: skip
     return prior.modes(sample(prior.sites()))
 

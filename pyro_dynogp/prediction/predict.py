@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,6 +16,7 @@ from pyro_dynogp.models.prepared import PreparedRecord, with_outputs
 from pyro_dynogp.prediction.first_state import beginning, unknown_beginning
 from pyro_dynogp.prediction.prediction import Parts, Prediction
 from pyro_dynogp.prediction.records import following, prepared
+from pyro_dynogp.support.errors import warn
 from pyro_dynogp.support.parallel import seeded
 
 if TYPE_CHECKING:
@@ -87,11 +87,10 @@ def warn_of_divergence(fit: Fitted, record: Record, runs: np.ndarray, kind: str)
     left = ~((runs > low - margin) & (runs < high + margin)).all(-1)
     if left.any():
         first = int(left.any(0).argmax())
-        warnings.warn(
+        warn(
             f"{kind}: {left.any(1).sum()} of {len(runs)} free runs leave the range of the training "
             f"outputs by more than {FAR:g} times its width, first at sample {first} (time "
-            f"{record.time[first]:.6g}). What follows is no prediction.",
-            stacklevel=7,
+            f"{record.time[first]:.6g}). What follows is no prediction."
         )
 
 

@@ -3,37 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-# Order of the autoregression. The pole has to multiply its state by exp(GROWTH) within the record,
-# and to lie SURE standard errors beyond the boundary of stability.
-ORDER, GROWTH, SURE = 8, 3.0, 3.0
+ORDER = 8  # of the autoregression
 
 
-@dataclass(frozen=True)
-class Growth:
-    """The least stable pole of an autoregression with inputs, by least squares.
+def least_stable_pole(
+    inputs: Sequence[np.ndarray], output: Sequence[np.ndarray]
+) -> tuple[float, float] | None:
+    """Log |z| [1/step] of the largest pole of an autoregression with inputs, and standard error.
 
-    Attributes:
-        rate: log |z| of its pole z, positive for an unstable one [1/step]. error: standard error.
-        steps: length of the longest record.
-    """
-
-    rate: float
-    error: float
-    steps: int
-
-    @property
-    def unstable(self) -> bool:
-        """Whether the pole is unstable beyond doubt, and matters within the record."""
-        return self.rate * self.steps > GROWTH and self.rate > SURE * self.error
-
-
-def growth(inputs: Sequence[np.ndarray], output: Sequence[np.ndarray]) -> Growth | None:
-    """The least stable pole of y_k = sum_i a_i y_(k-i) + sum_i b_i' u_(k-i) + c + e_k.
-
+    Of y_k = sum_i a_i y_(k-i) + sum_i b_i' u_(k-i) + c + e_k; positive for an unstable one.
     Least squares of one-step errors finds poles of plants in closed loops, stable or not (Ljung
     1999, System Identification, 13.4). None where too few rows are complete.
 
@@ -63,4 +44,4 @@ def growth(inputs: Sequence[np.ndarray], output: Sequence[np.ndarray]) -> Growth
     z = poles[np.argmax(np.abs(poles))]
     slope = z ** (ORDER - np.arange(1, ORDER + 1)) / np.polyval(np.polyder(a), z) / z
     error = np.sqrt(slope.real @ covariance @ slope.real)
-    return Growth(float(np.log(np.abs(z))), float(error), max(len(one) for one in output))
+    return float(np.log(np.abs(z))), float(error)

@@ -1,4 +1,4 @@
-"""Bad input: one form of error, and one table of what arguments have to be, by their names."""
+"""Bad input: one form of error and of warnings, and a table of what arguments have to be."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import functools
 import inspect
 import math
 import os
+import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
 from numbers import Integral, Real
@@ -172,3 +173,11 @@ def checked(function: Callable[Given, Result]) -> Callable[Given, Result]:
         return function(*bound.args, **bound.kwargs)
 
     return call
+
+
+def warn(message: str) -> None:
+    """Warn of the line that called the package."""
+    frame, level = inspect.currentframe(), 1
+    while frame is not None and str(frame.f_globals.get("__name__")).startswith("pyro_dynogp"):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, stacklevel=level)

@@ -17,7 +17,7 @@ from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.mode import grow
 from pyro_dynogp.inference.optimise.maximum import maximise
 from pyro_dynogp.inference.run import Run
-from pyro_dynogp.inference.starts.linear import starting_points
+from pyro_dynogp.inference.starts.plans import starting_points
 from pyro_dynogp.inference.starts.poles import grown
 from pyro_dynogp.models.variants import with_channel, with_pairs, without_process_noise
 from tests.discrepancy.made import SETTINGS, coloured

@@ -69,15 +69,17 @@ def test_a_model_without_functions_is_not_judged(monkeypatch):
 @pytest.mark.parametrize(
     ("model", "with_noise", "pays"),
     [
-        (dgp.Wiener(1), 1.24, True),
-        (dgp.Wiener(1), 1.26, False),
+        (dgp.Wiener(1), 1.49, True),
+        (dgp.Wiener(1), 1.51, False),
         (dgp.NonlinearFeedback(1), 0.98, True),
         (dgp.NonlinearFeedback(1), 1.0, False),
     ],
 )
 def test_what_process_noise_may_cost(monkeypatch, model, with_noise, pays):
     monkeypatch.setattr(free_runs, "free_run_error", lambda model, values, records: values)
-    assert noise_pays(model, [], optimum(0.0, with_noise), optimum(0.0, 1.0)) == pays
+    assert noise_pays(model, [], optimum(0.0, with_noise), optimum(0.0, 1.0), 1.5) == pays
+    if not model.has_feedback:  # nor has it to run better than both
+        assert noise_pays(model, [], optimum(0.0, 1.0), optimum(0.0, 1.0), 0.5)
 
 
 def bent(n=240):
@@ -127,3 +129,14 @@ def test_with_process_noise_blocks_begin_at_the_state_of_the_filter():
     whole = process.components(samples=200, seed=0).mean.mean(0)
     error = np.sqrt(np.mean((record.outputs - whole) ** 2)) / float(model.scaling.output_scale[0])
     assert free_runs.free_run_error(model, values, model.prepare(record)) < 0.97 * error
+
+
+def test_the_warning_is_of_the_line_that_called(monkeypatch):
+    monkeypatch.setattr(mode, "free_run_error", lambda model, *_: 1.0 + model.has_function)
+    with pytest.warns(UserWarning, match="no better than") as caught:
+        dgp.fit(
+            dgp.Wiener(1, pairs=1), bent(60), method="map", restarts=1, steps=2, workers=1,
+            progress=False,
+        )  # fmt: skip
+    said = [one for one in caught if "no better" in str(one.message)]
+    assert [one.filename for one in said] == [__file__]

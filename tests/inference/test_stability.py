@@ -58,10 +58,17 @@ def test_a_pole_is_slow_where_the_record_holds_fewer_than_three_time_constants(f
 
 def test_the_advice_is_of_the_kind_of_pole(fit):
     (said,) = warnings_of(slowed(fit, 1.0, frequency=20.0))
-    assert "oscillating" in said
+    assert "oscillates on" in said
     assert "Sinusoid" in said
     (said,) = warnings_of(slowed(fit, 1.0))
     assert "all but integrates" in said
+    assert "integrators=1" in said
+    (layer,) = fit.model.layers
+    model = replace(fit.model, layers=(replace(layer, integrators=1, process_noise=False),))
+    slow, one = slowed(fit, 1.0), torch.ones(1, dtype=torch.float64)
+    more = {"g_integrator_drift": one, "g_integrator_gain": one[None]}
+    (said,) = warnings_of(replace(slow, model=model, mode={**slow.mode, **more}))
+    assert "integrators=1" not in said
 
 
 def test_fit_summary_and_check_say_so():

@@ -10,8 +10,9 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 
 from pyro_dynogp.lti.covariance import autocovariance
 from pyro_dynogp.lti.response import mean_response
-from pyro_dynogp.lti.views import matern32, real_state_space
+from pyro_dynogp.lti.views import real_state_space
 from tests.lti import oracles
+from tests.lti.matern import matern32
 from tests.lti.oracles import NOISES, assert_close, random_system, tensor
 
 TAU = np.array([0.0, 0.1, 0.6, 2.0])

@@ -12,6 +12,7 @@ from pyro_dynogp.lti import views
 from pyro_dynogp.lti.covariance import autocovariance, stationary_variance
 from pyro_dynogp.lti.modes import Modes
 from tests.lti import oracles
+from tests.lti.matern import matern32
 from tests.lti.oracles import NOISES, assert_close, few, random_system, tensor
 
 OMEGA = np.array([-3.0, 0.0, 0.4, 2.0, 50.0])
@@ -168,7 +169,7 @@ class TestMatern32:
     )
     def test_error_bound_of_its_docstring(self, lengthscale, sd, split):
         bound = split**2 + 1e-15 / split**2
-        modes = views.matern32(lengthscale, sd, split=split)
+        modes = matern32(lengthscale, sd, split=split)
         lag = lengthscale * np.linspace(0.0, 6.0, 200)
         x = np.sqrt(3.0) * lag / lengthscale
         matern = np.exp(-x) * (1.0 + x)
@@ -179,7 +180,7 @@ class TestMatern32:
     def test_noise_enters_like_white_noise_through_a_double_pole(self):
         # The transfer function from noise: sqrt(12 sqrt3/l^3) sd / (s + a)^2.
         lengthscale, sd = 0.8, 1.7
-        modes = views.matern32(lengthscale, sd, split=1e-3)
+        modes = matern32(lengthscale, sd, split=1e-3)
         as_input = Modes(modes.poles, modes.L, modes.output_gain)
         G = views.frequency_response(as_input, OMEGA)[:, 0, 0].numpy()
         a = np.sqrt(3.0) / lengthscale

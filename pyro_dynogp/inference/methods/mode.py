@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -19,20 +18,20 @@ from pyro_dynogp.inference.optimise.gauss_newton import has_innovations
 from pyro_dynogp.inference.optimise.maximum import EFFORT, Effort, Optimizer, Optimum, maximise
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.run import Run
-from pyro_dynogp.inference.starts.linear import (
+from pyro_dynogp.inference.starts.plans import (
     RANDOM,
+    Values,
     linear_starts,
     linear_twins,
     optimizer_for,
     spread,
 )
-from pyro_dynogp.inference.starts.plans import Values
 from pyro_dynogp.inference.starts.poles import grown
 from pyro_dynogp.layers.noise import TYPICAL
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import Records, as_measured
 from pyro_dynogp.models.variants import without_noise_below_functions
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import invalid, warn
 from pyro_dynogp.support.frozen import FrozenMapping
 
 # Most iterations of linear fits by each optimizer.
@@ -151,22 +150,21 @@ def cascade_optima(problem: Problem, run: Run, optimizer: Optimizer, steps: int)
     for attempt in range(ATTEMPTS):
         again = replace(run, seed=run.seed + attempt)
         twins = linear_twins(model, records, again, steps)
+        lines = [t for t in twins.values() if model.has_function and t[0].outputs == model.outputs]
+        least = min([least, *(free_run_error(one, at[0], own) for one, own, at in lines)])
         starts = spread(model, records, twins, run.restarts or usual, again.seed)
         warm = [] if learnt is None else [grown(learnt, starts[0])]
         optima += climb(
             model, records, starts, warm, again, steps=steps, optimizer=optimizer,
-            prefix=f"again-{attempt}-" if attempt else "", judged=True,
+            prefix=f"again-{attempt}-" if attempt else "", line=least,
         )  # fmt: skip
-        lines = [twin for twin in twins.values() if twin[0].outputs == model.outputs]
-        if not model.has_function or not lines:
+        if not lines:
             return optima
         optima.sort(key=lambda one: one.energy)
-        errors = [free_run_error(twin, values[0], own) for twin, own, values in lines]
-        least = min(least, *errors)
         holding = [one for one in optima if free_run_error(model, one.values, records) <= least]
         if holding:
             return holding
-    warnings.warn(NO_BETTER, stacklevel=2)
+    warn(NO_BETTER)
     return optima
 
 
@@ -197,18 +195,19 @@ def climb(
     optimizer: Optimizer,
     effort: Effort = EFFORT,
     prefix: str = "",
-    judged: bool = False,
+    line: float = math.inf,
 ) -> list[Optimum]:
     """Optima of the collapsed model from fresh starts and from what is learnt, best first.
 
     Where static layers see process noise fresh starts take half of the steps without any, which
     needs no filter, and the better half of them takes the other half with it. Such noise can
     explain all that dynamics and functions should: from a poor start to a high density and poor
-    forecasts. With feedback, or where it is `judged`, it stays only where it pays (`noise_pays`).
+    forecasts. With feedback, or beside a linear model, it stays only where it pays (`noise_pays`).
 
     Args:
         model: collapsed. records: of it. starts, learnt: values of all sites. run: how.
         steps: most of each start. optimizer, effort: of climbs. prefix: of keys of checkpoints.
+        line: error of free runs of the linear model, infinite where noise is not judged.
     """
     effort = replace(effort, kept=0.5)
 
@@ -228,11 +227,11 @@ def climb(
     elif model.has_feedback:
         starts = [_louder(start) for start in starts]
     optima = optima_of(model, [*learnt, *starts], f"{prefix}cascade")
-    if not better or not (model.has_feedback or judged):
+    if not better or not (model.has_feedback or math.isfinite(line)):
         return optima
     prepared = model.prepare(records)
     silent = [silenced(model, prepared, one, starts[0]) for one in better]
-    return optima if noise_pays(model, prepared, optima[0], silent[0]) else silent
+    return optima if noise_pays(model, prepared, optima[0], silent[0], line) else silent
 
 
 def grow(

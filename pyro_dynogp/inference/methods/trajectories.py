@@ -25,7 +25,7 @@ from pyro_dynogp.inference.methods.trajectory_guide import (
 )
 from pyro_dynogp.inference.posteriors import Sampled
 from pyro_dynogp.inference.run import Run
-from pyro_dynogp.inference.starts.linear import starting_points
+from pyro_dynogp.inference.starts.plans import starting_points
 from pyro_dynogp.layers.sites import Arguments, Program
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord

@@ -7,12 +7,12 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-from pyro_dynogp.data.scaling import Scaling
+from pyro_dynogp.data.scaling import Scaling, TimeScale
 from pyro_dynogp.inference.starts.poles import WALKS, random_poles
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord
-from pyro_dynogp.models.priors import TimeScale
 from pyro_dynogp.models.wiring import Dynamic, Known, Wire
 
 Values = dict[str, Tensor]
@@ -64,9 +64,8 @@ class DynamicStart:
             gain = values.get(self._key("input_gain"), none)
             values[self._key("input_gain")] = self._fed_back(gain)
             if self._key("integrator_gain") in values:
-                nothing = torch.zeros(len(values[self._key("integrator_gain")]), self.one.fed)
-                levels = [values[self._key("integrator_gain")], nothing.double()]
-                values[self._key("integrator_gain")] = torch.cat(levels, 1)
+                level = values[self._key("integrator_gain")]
+                values[self._key("integrator_gain")] = pad(level, (0, self.one.fed))
         if layer.outputs > 1 and self._key("output_gain") not in values:
             # One signal is the linear fit; the others see the same modes with other gains.
             P = layer.pairs

@@ -10,16 +10,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pyro_dynogp.data.scaling import Scaling
+from pyro_dynogp.data.scaling import Scaling, TimeScale
 from pyro_dynogp.layers.noise import TYPICAL
 from pyro_dynogp.layers.sites import Site
 from pyro_dynogp.lti.grid import TimeGrid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import held_states
+from pyro_dynogp.lti.views import numerators
 from pyro_dynogp.models.horseshoe import HORSESHOE_SCALE
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord
-from pyro_dynogp.models.priors import TimeScale, numerators
 
 # How far the random walk beside an integrator gets at a start, see `ModesPrior`.
 WALKS = 0.1

@@ -17,11 +17,10 @@ import scipy.linalg
 from numpy.lib.stride_tricks import sliding_window_view
 from torch import Tensor
 
-from pyro_dynogp.data.scaling import Scaling
+from pyro_dynogp.data.scaling import Scaling, TimeScale
 from pyro_dynogp.inference.starts.poles import grown, random_poles, values_given_poles
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord
-from pyro_dynogp.models.priors import TimeScale
 
 # Samples of past and of future beyond the order; so many windows for each row at least, and about
 # so many of each record at most, evenly spread.
