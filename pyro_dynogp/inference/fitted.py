@@ -138,7 +138,19 @@ class Fitted:
         return self.history if self.method == "svi" else -self.history
 
     def at_mode(self) -> Self:
-        """The same fit with its posterior mode in place of its draws."""
+        """The same fit with its posterior mode in place of its draws.
+
+        Raises:
+            ValueError: where trajectories were sites: their mode is not that of the parameters
+                with trajectories integrated out, which a mode stands for.
+        """
+        if not self.collapsed:
+            raise invalid(
+                "fit",
+                expected="a fit whose trajectories are integrated out",
+                got="one with trajectories as sites",
+                advice="Fit with method='map' for a mode; values of its parameters are in `mode`.",
+            )
         if self.method == "map":
             return self
         draws = FrozenMapping({name: value.unsqueeze(0) for name, value in self.mode.items()})

@@ -20,6 +20,7 @@ from pyro_dynogp.inference.starts.plans import (
     Values,
     leading_layers,
     linear_twin,
+    one_output,
     plans,
     starting_point,
 )
@@ -58,7 +59,7 @@ def starting_points(
         assert isinstance(one.layer, Dynamic)
         twin = linear_twin(model, one.layer, model.scaling)
         if twin not in known:
-            training = _one_output(records) if twin.outputs < model.outputs else tuple(records)
+            training = one_output(records) if twin.outputs < model.outputs else tuple(records)
             twin = twin.scaled_to(training)
             found = maximise(
                 twin,
@@ -80,7 +81,7 @@ def starting_points(
         ]
 
 
-def _louder(values: Values) -> Values:
+def louder(values: Values) -> Values:
     """A start whose measurement noise can stand for what dynamics and functions lack as yet.
 
     Linear fits leave that to process noise. Without any, noise of their size makes the density so
@@ -91,10 +92,6 @@ def _louder(values: Values) -> Values:
         name: value.clamp_min(least[name]) if name in least else value
         for name, value in values.items()
     }
-
-
-def _one_output(records: Sequence[Record]) -> tuple[Record, ...]:
-    return tuple(record.select(outputs=[record.output_names[0]]) for record in records)
 
 
 @dataclass(frozen=True)
@@ -222,28 +219,8 @@ def climb(
     if quiet != model and starts:
         steps = max(1, steps // 2)
         key = "without-process-noise"
-        louder = [_louder(start) for start in starts]
-        found = maximise(quiet, records, louder, steps=steps, key=key, **options)
+        loud = [louder(start) for start in starts]
+        found = maximise(quiet, records, loud, steps=steps, key=key, **options)
         better = found[: (len(starts) + 1) // 2]
         starts = [grown(one.values, starts[0]) for one in better]
     return maximise(model, records, [*learnt, *starts], steps=steps, key="cascade", **options)
-
-
-def grow(
-    model: Model, record: Record, learnt: Values, start: Values, *, steps: int, seed: int
-) -> list[Optimum]:
-    """Optima of the collapsed model near what a smaller model, or the same one, has learnt.
-
-    Process noise that has explained what the smaller model lacks keeps the larger one from
-    explaining it: one climb goes without any first, and takes that of `start` then.
-    """
-    options: dict[str, Any] = {
-        "steps": steps, "seed": seed, "workers": 1, "optimizer": "preconditioned",
-    }  # fmt: skip
-    starts = [learnt]
-    quiet = without_noise_below_functions(model)
-    if quiet != model:
-        (found, *_) = maximise(quiet, record, [_louder(learnt)], key="grown-quiet", **options)
-        starts.append(grown(found.values, start))
-    optima = [maximise(model, record, [one], key="grown", **options)[0] for one in starts]
-    return sorted(optima, key=lambda one: one.energy)

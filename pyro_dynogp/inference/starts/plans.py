@@ -48,6 +48,11 @@ def leading_layers(model: Model) -> tuple[Wire, ...]:
     )
 
 
+def one_output(records: Sequence[Record]) -> tuple[Record, ...]:
+    """Records with their first output alone."""
+    return tuple(record.select(outputs=[record.output_names[0]]) for record in records)
+
+
 @dataclass(frozen=True)
 class Plan:
     """One restart: which layer takes over which linear optimum.

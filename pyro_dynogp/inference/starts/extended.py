@@ -1,0 +1,116 @@
+"""Starting points of a model that extends a fitted one: what is learnt, and what is new."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.starts.dynamic import Values
+from pyro_dynogp.inference.starts.plans import (
+    Plan,
+    leading_layers,
+    linear_twin,
+    one_output,
+    starting_point,
+)
+from pyro_dynogp.inference.starts.poles import grown, random_poles, values_given_poles
+from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.wiring import Dynamic, Static
+from pyro_dynogp.support.parallel import seeded
+
+# Random sets of poles that are new, and how many of them linear models start from.
+TRIES, KEPT = 24, 3
+
+
+def extended_starts(
+    base: Fitted, model: Model, records: Sequence[Record], seed: int
+) -> tuple[list[Values], Values]:
+    """Starts at what a fit has learnt, and the values of what is new before that is taken over.
+
+    A linear model keeps its poles; its gains come from least squares in one start, from the fit in
+    another. Other models keep all values of the layers that they have in common with the fit, and
+    what is new does nothing yet: new inputs have no gain, a new function is a straight line. A
+    function on top of what was the last layer is also tried as the mean output given its input,
+    as a line lets the dynamics first imitate what the function should do.
+
+    Args:
+        base: of a model that `model` extends. model: with the scaling of `records`.
+        seed: of new poles.
+    """
+    assert model.scaling is not None
+    learnt = _renamed(base, model)
+    sites = model.all_sites(model.scaling, len(records))
+    poles = {wire.name: x.modes.poles.numpy() for wire, x in base.system_at(base.mode).dynamic}
+    old = {new: poles[name] for name, new in _places(base.model, model).items() if name in poles}
+    none = np.zeros(0, dtype=complex)
+    if model.is_linear:
+        ((wire, _),) = model.dynamic
+        given = _given_poles(model, records, old.get(wire.name, none), seed)
+        return [*given, grown(learnt, given[0])], given[0]
+    leading = next(iter(leading_layers(model)), None)
+    name, fresh, linear = None, None, None
+    if leading is not None:
+        assert isinstance(leading.layer, Dynamic)
+        name = leading.name
+        twin = linear_twin(model, leading.layer, model.scaling)
+        training = one_output(records) if twin.outputs < model.outputs else tuple(records)
+        twin = twin.scaled_to(training)
+        assert twin.scaling is not None
+        (fresh, *_) = _given_poles(twin, training, old.get(name, none), seed)
+        own = {_moved(site, name, "g"): value for site, value in learnt.items()}
+        linear = grown(own, fresh, twin.all_sites(twin.scaling, len(training)))
+    topped = isinstance(model.layers[-1], Static) and isinstance(base.model.layers[-1], Dynamic)
+    plans = [Plan(name, fresh, False, seed), Plan(name, linear, False, seed)]
+    if topped:
+        plans.append(Plan(name, linear, True, seed))
+    with seeded(seed):  # what has no typical value is drawn
+        new, *starts = [starting_point(model, records, model.scaling, plan) for plan in plans]
+    if topped and leading is not None:  # scaled to unit size, for the function above
+        learnt = {k: v for k, v in learnt.items() if not k.startswith(f"{leading.name}_")}
+    return [grown(learnt, start, sites) for start in starts], new
+
+
+def _given_poles(
+    model: Model, records: Sequence[Record], poles: np.ndarray, seed: int
+) -> list[Values]:
+    """Values of a linear model by least squares given its poles, and new ones, the best first."""
+    assert model.scaling is not None
+    ((_, layer),) = model.dynamic
+    generator = np.random.default_rng(seed)
+    more = layer.pairs - len(poles)
+    found = []
+    for _ in range(TRIES if more > 0 else 1):
+        kept = poles[: layer.pairs]
+        if more > 0:
+            kept = np.concatenate([kept, random_poles(more, model.scaling, generator)])
+        found.append(values_given_poles(model, records, model.scaling, kept))
+    return [values for _, values in sorted(found, key=lambda one: one[0])[:KEPT]]
+
+
+def _places(base: Model, model: Model) -> dict[str, str]:
+    """Names of layers in an extended model by their names in the model that it extends.
+
+    A layer more is the first one where that is a function and was none before, else the last.
+    """
+    first = isinstance(model.layers[0], Static) and not isinstance(base.layers[0], Static)
+    skipped = len(model.layers) - len(base.layers) if first else 0
+    pairs = zip(base.wires, model.wires[skipped:], strict=False)
+    return {old.name: new.name for old, new in pairs}
+
+
+def _renamed(base: Fitted, model: Model) -> Values:
+    """Values at the mode of a fit, by the names that they have in a model that extends it."""
+    places = _places(base.model, model)
+    found = {}
+    for name, value in base.mode.items():
+        of = max((k for k in places if name.startswith(f"{k}_")), key=len, default=None)
+        found[name if of is None else _moved(name, of, places[of])] = value
+    return found
+
+
+def _moved(site: str, layer: str, other: str) -> str:
+    """Name of a layer's site in another layer; that of any other site."""
+    return other + site[len(layer) :] if site.startswith(f"{layer}_") else site
