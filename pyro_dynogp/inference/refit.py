@@ -8,7 +8,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.records import as_records
@@ -78,13 +77,7 @@ def refit(
     """
     run = run or Run(fit.seed, workers=1)
     several = as_records(records)
-    if not fit.collapsed:
-        raise invalid(
-            "fit",
-            expected="a fit whose trajectories are integrated out",
-            got="one with trajectories as sites, whose guide belongs to its record",
-            advice="Fit with guide='collapsed', or do without refits.",
-        )
+    fit.check_collapsed()
     if model is None:
         if len(several) != len(fit.records):
             raise invalid(
@@ -241,43 +234,23 @@ def _posterior(
         return mode
     count = len(next(iter(fit.draws.values())))
     if fit.method == "nuts":
-        draws = FrozenMapping(_sampled(fit, problem, optima[0], count, run))
+        chains = int(fit.diagnostics["chains"])
+        found = sample_posterior(
+            problem.target, problem.argument, optima[0].values, chains=chains,
+            draws=count // chains, warmup=WARMUP, seed=run.seed, workers=run.workers,
+            progress=False,
+        )  # fmt: skip
+        draws = FrozenMapping({name: x.flatten(0, 1) for name, x in found.draws.items()})
         return replace(mode, posterior=Sampled(draws), draws=draws, diagnostics=fit.diagnostics)
     family = family_of(fit)
-    found = posterior_of(
-        problem.target,
-        problem.argument,
-        list(optima),
-        family,
-        free=free_sites(problem),
-        steps=POLISH if family == "map" else SVI_STEPS,
-        run=replace(run, steps=None, restarts=None),
-    )
+    fitted = posterior_of(
+        problem.target, problem.argument, list(optima), family, free=free_sites(problem),
+        steps=POLISH if family == "map" else SVI_STEPS, run=run,
+    )  # fmt: skip
     with seeded(run.seed):
-        drawn = draws_of_guide(found.guide, count)
+        drawn = draws_of_guide(fitted.guide, count)
     return replace(
-        mode,
-        posterior=found.guide,
-        mode=FrozenMapping(found.mode),
+        mode, posterior=fitted.guide, mode=FrozenMapping(fitted.mode), history=fitted.elbo,
         draws=FrozenMapping({name: drawn[name] for name in mode.mode}),
-        history=found.elbo,
         diagnostics=fit.diagnostics,
-    )
-
-
-def _sampled(
-    fit: Fitted, problem: Problem, best: Optimum, count: int, run: Run
-) -> dict[str, Tensor]:
-    chains = int(fit.diagnostics["chains"])
-    found = sample_posterior(
-        problem.target,
-        problem.argument,
-        best.values,
-        chains=chains,
-        draws=count // chains,
-        warmup=WARMUP,
-        seed=run.seed,
-        workers=run.workers,
-        progress=False,
-    )
-    return {name: value.flatten(0, 1) for name, value in found.draws.items()}
+    )  # fmt: skip

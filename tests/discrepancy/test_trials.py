@@ -18,8 +18,14 @@ from pyro_dynogp.inference.refit import refit
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.extended import extended_starts
 from pyro_dynogp.inference.starts.poles import grown
-from pyro_dynogp.models.variants import with_channel, with_pairs, without_process_noise
-from tests.discrepancy.made import coloured
+from pyro_dynogp.models.variants import (
+    with_channel,
+    with_input_function,
+    with_output_function,
+    with_pairs,
+    without_process_noise,
+)
+from tests.discrepancy.made import coloured, fitted_mode
 from tests.discrepancy.plant_dynamics import System, response
 
 NOISE, N, TRAINING = 0.05, 320, 220
@@ -66,6 +72,32 @@ def test_what_has_grown_starts_at_the_likelihood_of_its_base(record, base, more)
     # A new pair has a little process noise already.
     assert after == pytest.approx(before, rel=1e-9 if more == "channel" else 1e-2)
     assert abs(loud - before) > 4.0 * max(abs(after - before), 1.0)
+
+
+@pytest.mark.parametrize("first", [True, False])
+@pytest.mark.parametrize("kind", ["linear", "Wiener", "Hammerstein"])
+def test_a_function_more_starts_as_a_line(record, base, kind, first):
+    """The model with it explains what its base does, of whatever layers that is."""
+    training = record[:TRAINING]
+    if kind == "linear":
+        given = fitted_mode(dgp.LinearDynamicGP(1, pairs=1), training)
+    else:
+        given = base
+        if kind == "Hammerstein":
+            model = dgp.Hammerstein(1, pairs=1, inducing=6)
+            given = dgp.fit(model, training, method="map", restarts=1, steps=60, workers=1,
+                            progress=False)  # fmt: skip
+    plain = replace(given.model, scaling=None)
+    extended = with_input_function(plain) if first else with_output_function(plain)
+    if extended is None:  # there is one already
+        assert kind == ("Hammerstein" if first else "Wiener")
+        return
+    records = extended.check(training)
+    target = extended.scaled_to(records).collapsed
+    (learnt, *curved), _ = extended_starts(given, target, records, 0)
+    before = log_likelihood(given.model.collapsed, given.model.check(training), given.mode)
+    assert log_likelihood(target, records, learnt) == pytest.approx(before, abs=5.0)
+    assert len(curved) == (not first)
 
 
 def test_an_extended_cascade_explains_what_its_base_lacks(record, base):

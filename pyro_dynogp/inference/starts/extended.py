@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -41,10 +41,11 @@ def extended_starts(
         seed: of new poles.
     """
     assert model.scaling is not None
-    learnt = _renamed(base, model)
+    places = _places(base.model, model)
+    learnt = {_renamed(site, places): value for site, value in base.mode.items()}
     sites = model.all_sites(model.scaling, len(records))
-    poles = {wire.name: x.modes.poles.numpy() for wire, x in base.system_at(base.mode).dynamic}
-    old = {new: poles[name] for name, new in _places(base.model, model).items() if name in poles}
+    dynamic = base.system_at(base.mode).dynamic
+    old = {places.get(wire.name): layer.modes.poles.numpy() for wire, layer in dynamic}
     none = np.zeros(0, dtype=complex)
     if model.is_linear:
         ((wire, _),) = model.dynamic
@@ -60,7 +61,7 @@ def extended_starts(
         twin = twin.scaled_to(training)
         assert twin.scaling is not None
         (fresh, *_) = _given_poles(twin, training, old.get(name, none), seed)
-        own = {_moved(site, name, "g"): value for site, value in learnt.items()}
+        own = {_renamed(site, {name: "g"}): value for site, value in learnt.items()}
         linear = grown(own, fresh, twin.all_sites(twin.scaling, len(training)))
     topped = isinstance(model.layers[-1], Static) and isinstance(base.model.layers[-1], Dynamic)
     plans = [Plan(name, fresh, False, seed), Plan(name, linear, False, seed)]
@@ -101,16 +102,7 @@ def _places(base: Model, model: Model) -> dict[str, str]:
     return {old.name: new.name for old, new in pairs}
 
 
-def _renamed(base: Fitted, model: Model) -> Values:
-    """Values at the mode of a fit, by the names that they have in a model that extends it."""
-    places = _places(base.model, model)
-    found = {}
-    for name, value in base.mode.items():
-        of = max((k for k in places if name.startswith(f"{k}_")), key=len, default=None)
-        found[name if of is None else _moved(name, of, places[of])] = value
-    return found
-
-
-def _moved(site: str, layer: str, other: str) -> str:
-    """Name of a layer's site in another layer; that of any other site."""
-    return other + site[len(layer) :] if site.startswith(f"{layer}_") else site
+def _renamed(site: str, places: Mapping[str, str]) -> str:
+    """Name of a layer's site where the layer has another name; that of any other site."""
+    layer = max((name for name in places if site.startswith(f"{name}_")), key=len, default=None)
+    return site if layer is None else places[layer] + site[len(layer) :]
