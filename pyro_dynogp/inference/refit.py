@@ -80,9 +80,8 @@ def refit(
     fit.check_collapsed()
     if model is None:
         if len(several) != len(fit.records):
-            raise invalid(
-                "records", expected=f"{len(fit.records)}, as before", got=str(len(several))
-            )
+            expected = f"{len(fit.records)}, as before"
+            raise invalid("records", expected=expected, got=str(len(several)))
         problem = Problem(fit.model, several)
         optima = _again(fit, problem, run)
     else:

@@ -81,13 +81,11 @@ def _given_poles(
     assert model.scaling is not None
     ((_, layer),) = model.dynamic
     generator = np.random.default_rng(seed)
-    more = layer.pairs - len(poles)
+    kept, more = poles[: layer.pairs], max(0, layer.pairs - len(poles))
     found = []
-    for _ in range(TRIES if more > 0 else 1):
-        kept = poles[: layer.pairs]
-        if more > 0:
-            kept = np.concatenate([kept, random_poles(more, model.scaling, generator)])
-        found.append(values_given_poles(model, records, model.scaling, kept))
+    for _ in range(TRIES if more else 1):
+        both = np.concatenate([kept, random_poles(more, model.scaling, generator)])
+        found.append(values_given_poles(model, records, model.scaling, both))
     return [values for _, values in sorted(found, key=lambda one: one[0])[:KEPT]]
 
 
