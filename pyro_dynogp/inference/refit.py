@@ -14,7 +14,7 @@ from pyro_dynogp.data.records import as_records
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.methods.base import Problem
-from pyro_dynogp.inference.methods.mode import at_optimum, louder
+from pyro_dynogp.inference.methods.mode import at_optimum, climb, louder, starting_points
 from pyro_dynogp.inference.methods.nuts import sample_posterior
 from pyro_dynogp.inference.methods.optima import POLISH, Hyperparameters, free_sites, posterior_of
 from pyro_dynogp.inference.optimise.descent import descend
@@ -29,14 +29,16 @@ from pyro_dynogp.inference.starts.poles import grown, starting_values
 from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.variants import without_noise_below_functions
+from pyro_dynogp.support.checkpoints import NOTHING_KEPT
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import seeded
 
 # Iterations from the old optima, and of Adam and SVI where they are of a model with functions.
 SAME_STEPS, ADAM_STEPS, SVI_STEPS = 300, 200, 400
-# Iterations of extended models, linear and others, and fresh starts of linear ones.
-LINEAR_STEPS, LAYERED_STEPS, FRESH = 120, 150, 2
+# Iterations of extended models: linear, others of the same layers, with a layer more; fresh starts
+# of the first and the last.
+LINEAR_STEPS, LAYERED_STEPS, ADDED_STEPS, FRESH = 120, 150, 300, 2
 # Of the same model every start goes on, near its optimum; of a linear one that is extended half of
 # them do, side by side, as processors are kept busy by other trials.
 AGAIN = Effort(kept=1.0, rate=0.004, near=True)
@@ -68,8 +70,8 @@ def refit(
         fit: the old fit.
         records: one or several; of the same model as many as it has, with the same channels.
         model: that extends the one of the fit, or that one again in other units; None for the same.
-        run: steps are those of each start, restarts the fresh starts of an extended linear model;
-            by default with the seed of the fit, in this process.
+        run: steps are those of each start, restarts the fresh starts of a linear model and of one
+            with a layer more; by default with the seed of the fit, in this process.
 
     Raises:
         ValueError: on a fit with trajectories as sites, whose guide belongs to its record, on
@@ -173,6 +175,10 @@ def _again(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
 def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     """Optima of a model that extends that of a fit.
 
+    With a layer more Adam climbs, as in a first fit, also from fresh starts: better optimisers find
+    modes that fit the noise (a function that is flat where outputs repeat), and what is learnt
+    without an input function may be too far from what is right with it.
+
     Process noise that has explained what the smaller model lacks keeps the larger one from
     explaining it: one climb goes without any first, and takes that of a fresh start then.
     """
@@ -186,6 +192,13 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
         count = run.restarts or FRESH
         fresh = starting_values(model, problem.records, count=count, seed=run.seed)
         starts, options["effort"] = [*fresh, *starts], EXTENDED
+    if len(model.layers) > len(fit.model.layers):
+        options |= {"optimizer": "adam", "steps": run.steps or ADDED_STEPS}
+        fresh = starting_points(
+            target, problem.records, run.restarts or FRESH, LINEAR_STEPS, run.seed, run.workers,
+            False, NOTHING_KEPT,
+        )  # fmt: skip
+        return climb(target, problem.argument, [*starts, *fresh], [], **options)
     quiet = without_noise_below_functions(target)
     if quiet != target:
         (found, *_) = maximise(quiet, problem.argument, [louder(x) for x in starts], **options)
