@@ -12,7 +12,6 @@ from typing import get_args
 
 import numpy as np
 
-from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.density import WALL
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.free_runs import free_run_error, noise_pays, silenced
@@ -25,6 +24,7 @@ from pyro_dynogp.inference.starts.plans import (
     Values,
     leading_layers,
     linear_twin,
+    one_output,
     plans,
     starting_point,
 )
@@ -74,7 +74,7 @@ def starting_points(
         assert isinstance(one.layer, Dynamic)
         linear = linear_twin(model, one.layer, scaling)
         if linear not in known:
-            training = tuple(records) if linear.outputs == model.outputs else _one_output(records)
+            training = tuple(records) if linear.outputs == model.outputs else one_output(records)
             twin = replace(linear, scaling=training[0].scaling)
             found = maximise(
                 twin,
@@ -93,7 +93,7 @@ def starting_points(
         ]
 
 
-def _louder(values: Values) -> Values:
+def louder(values: Values) -> Values:
     """A start whose measurement noise can stand for what dynamics and functions lack as yet.
 
     Linear fits leave that to process noise. Without any, noise of their size makes the density so
@@ -104,13 +104,6 @@ def _louder(values: Values) -> Values:
         name: value.clamp_min(least[name]) if name in least else value
         for name, value in values.items()
     }
-
-
-def _one_output(records: Sequence[PreparedRecord]) -> tuple[PreparedRecord, ...]:
-    names = [records[0].record.output_names[0]]
-    selected = [each.record.select(outputs=names) for each in records]
-    scaling = Scaling.from_records(selected)
-    return tuple(PreparedRecord.of(record, scaling) for record in selected)
 
 
 @dataclass(frozen=True)
@@ -296,35 +289,14 @@ def climb(
     if quiet != model and starts:
         steps = max(1, steps // 2)
         key = f"{prefix}without-process-noise"
-        found = optima_of(quiet, [_louder(start) for start in starts], key)
+        found = optima_of(quiet, [louder(start) for start in starts], key)
         better = found[: (len(starts) + 1) // 2]
         starts = [grown(one.values, starts[0]) for one in better]
     elif model.has_feedback:
-        starts = [_louder(start) for start in starts]
+        starts = [louder(start) for start in starts]
     optima = optima_of(model, [*learnt, *starts], f"{prefix}cascade")
     if not model.has_feedback or not better:
         return optima
     prepared = model.prepare(records)
     silent = [silenced(model, prepared, one, starts[0]) for one in better]
     return optima if noise_pays(model, prepared, optima[0], silent[0]) else silent
-
-
-def grow(
-    model: Model, records: Records, learnt: Values, start: Values, run: Run, *, steps: int
-) -> list[Optimum]:
-    """Optima of the collapsed model near what a smaller model, or the same one, has learnt.
-
-    Process noise that has explained what the smaller model lacks keeps the larger one from
-    explaining it: one climb goes without any first, and takes that of `start` then.
-    """
-
-    def climbed(target: Model, point: Values, key: str) -> Optimum:
-        return maximise(
-            target, records, [point], run, optimizer="preconditioned", steps=steps, key=key
-        )[0]
-
-    starts = [learnt]
-    quiet = without_noise_below_functions(model)
-    if quiet != model:
-        starts.append(grown(climbed(quiet, _louder(learnt), "grown-quiet").values, start))
-    return sorted((climbed(model, point, "grown") for point in starts), key=lambda o: o.energy)

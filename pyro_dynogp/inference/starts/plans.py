@@ -47,6 +47,14 @@ def leading_layers(model: Model) -> tuple[Wire, ...]:
     )
 
 
+def one_output(records: Sequence[PreparedRecord]) -> tuple[PreparedRecord, ...]:
+    """Records with their first output alone."""
+    names = [records[0].record.output_names[0]]
+    selected = [each.record.select(outputs=names) for each in records]
+    scaling = Scaling.from_records(selected)
+    return tuple(PreparedRecord.of(record, scaling) for record in selected)
+
+
 @dataclass(frozen=True)
 class Plan:
     """One restart: which layer takes over which linear optimum.
