@@ -6,9 +6,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TypeVar
 
+import numpy as np
 import torch
 
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.mode import at_optimum, climb, louder, starting_points
@@ -21,7 +23,7 @@ from pyro_dynogp.inference.posteriors import Mixture, Sampled, draws_of_guide
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.dynamic import Values
 from pyro_dynogp.inference.starts.extended import extended_starts
-from pyro_dynogp.inference.starts.poles import grown, starting_values
+from pyro_dynogp.inference.starts.poles import grown
 from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.variants import without_noise_below_functions
@@ -32,15 +34,15 @@ from pyro_dynogp.support.parallel import seeded
 # Iterations from the old optima, and of Adam and SVI where they are of a model with functions.
 SAME_STEPS, ADAM_STEPS, SVI_STEPS = 300, 200, 400
 # Iterations of extended models: linear, others of the same layers, with a layer more; fresh starts
-# of the first and the last.
-LINEAR_STEPS, LAYERED_STEPS, ADDED_STEPS, FRESH = 100, 150, 300, 2
+# of the last.
+LINEAR_STEPS, LAYERED_STEPS, ADDED_STEPS, FRESH = 100, 100, 300, 2
 # Of the same model every start goes on, near its optimum; of a linear one that is extended half of
 # them do, side by side, as processors are kept busy by other trials.
 AGAIN = Effort(kept=1.0, rate=0.004, near=True)
 EXTENDED = Effort(kept=1 / 2, together=8)
 # Iterations of all variants of an effect, by Gauss-Newton and of others, and more of the leading
 # ones: this share, three at least.
-FIRST_STEPS, MORE_STEPS = (3, 8), (12, 32)
+FIRST_STEPS, MORE_STEPS = (2, 8), (12, 32)
 LEADING, FEWEST = 1 / 5, 3
 # Of NUTS, whose chains start at the mode.
 WARMUP = 300
@@ -64,8 +66,8 @@ def refit(
         fit: the old fit.
         records: one or several; of the same model as many as it has, with the same channels.
         model: that extends the one of the fit, or that one again in other units; None for the same.
-        run: steps are those of each start, restarts the fresh starts of a linear model and of one
-            with a layer more; by default with the seed of the fit, in this process.
+        run: steps are those of each start, of which a linear model has one where they are given;
+            by default with the seed of the fit, in this process.
 
     Raises:
         ValueError: on a fit with trajectories as sites, whose guide belongs to its record, on
@@ -180,8 +182,9 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
         )  # fmt: skip
 
     if target.is_linear:
-        fresh = [] if run.steps else starting_values(target, records, count=FRESH, seed=run.seed)
-        return climbed(target, [*fresh, *starts], LINEAR_STEPS)
+        if run.steps:
+            return climbed(target, [_best(problem, starts)], run.steps)
+        return climbed(target, starts, LINEAR_STEPS)
     if len(target.layers) > len(fit.model.layers):
         steps = run.steps or ADDED_STEPS
         fresh = starting_points(target, records, run, count=FRESH, steps=min(LINEAR_STEPS, steps))
@@ -192,6 +195,13 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
         best = climbed(quiet, [louder(start) for start in starts], LAYERED_STEPS)[0]
         starts = [*starts, grown(best.values, new)]
     return climbed(target, starts, LAYERED_STEPS)
+
+
+def _best(problem: Problem, starts: Sequence[Values]) -> Values:
+    """The most probable of several starts."""
+    potential = Potential(problem.target, (problem.records,), starts[0])
+    z = np.stack([potential.pack(start).numpy() for start in starts])
+    return starts[int(potential.values_and_gradients(z)[0].argmin())]
 
 
 def _posterior(

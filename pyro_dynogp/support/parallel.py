@@ -7,6 +7,7 @@ Work goes through joblib. By default it runs in local processes; inside
 from __future__ import annotations
 
 import contextlib
+import functools
 import random
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
@@ -15,7 +16,7 @@ import joblib
 import numpy as np
 import torch
 from joblib.parallel import get_active_backend
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 from tqdm import tqdm
 
 from pyro_dynogp.support.errors import invalid
@@ -34,10 +35,16 @@ def one_thread() -> Iterator[None]:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with threadpool_limits(1):
+        with _libraries().limit(limits=1):
             yield
     finally:
         torch.set_num_threads(threads)
+
+
+@functools.cache
+def _libraries() -> ThreadpoolController:
+    """Libraries of linear algebra that are loaded: to look for them takes milliseconds."""
+    return ThreadpoolController()
 
 
 @contextlib.contextmanager
