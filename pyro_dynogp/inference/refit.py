@@ -13,12 +13,18 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.methods.base import Problem
-from pyro_dynogp.inference.methods.mode import at_optimum, climb, louder, starting_points
+from pyro_dynogp.inference.methods.mode import (
+    at_optimum,
+    climb,
+    louder,
+    optimizer_near,
+    starting_points,
+)
 from pyro_dynogp.inference.methods.nuts import sample_posterior
 from pyro_dynogp.inference.methods.optima import POLISH, Hyperparameters, posterior_of
 from pyro_dynogp.inference.methods.svi import Schedule
 from pyro_dynogp.inference.optimise.gauss_newton import has_innovations
-from pyro_dynogp.inference.optimise.maximum import Effort, Optimizer, Optimum, maximise
+from pyro_dynogp.inference.optimise.maximum import Effort, Optimum, maximise
 from pyro_dynogp.inference.posteriors import Mixture, Sampled, draws_of_guide
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.dynamic import Values
@@ -143,11 +149,6 @@ def _problem(model: Model, records: Sequence[Record]) -> Problem:
     return Problem.of(model, [where_inputs_are_known(record, late) for record in records])
 
 
-def _near(model: Model) -> Optimizer:
-    """The optimizer that goes on from near an optimum."""
-    return "gauss-newton" if has_innovations(model) else "preconditioned"
-
-
 def _again(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     """Optima of the same model: of functions by Adam, as before, but where the mode is wanted.
 
@@ -155,7 +156,7 @@ def _again(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     """
     adam = fit.model.has_function and fit.method != "map"
     steps = run.steps or (ADAM_STEPS if adam else SAME_STEPS)
-    optimizer = "adam" if adam else _near(fit.model)
+    optimizer = "adam" if adam else optimizer_near(fit.model)
     return maximise(
         problem.target, problem.records, optima_of(fit), run, optimizer=optimizer, steps=steps,
         effort=AGAIN,
@@ -177,7 +178,7 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
 
     def climbed(model: Model, points: Sequence[Values], usual: int) -> list[Optimum]:
         return maximise(
-            model, records, points, run, optimizer=_near(model), steps=run.steps or usual,
+            model, records, points, run, optimizer=optimizer_near(model), steps=run.steps or usual,
             effort=EXTENDED,
         )  # fmt: skip
 

@@ -28,11 +28,12 @@ class Run:
     Attributes:
         seed: of everything that is drawn. workers: processes, None for all processors.
         progress: whether to show progress bars. checkpoints: where finished pieces are kept.
-        restarts: number of starting points, None for what the method and the model suggest.
+        restarts: number of starting points, None for what the method and the model suggest, 0 for
+            the fit to start from alone.
         steps: most iterations, None for the same.
 
     Raises:
-        ValueError: where restarts or steps is not a positive number.
+        ValueError: where restarts is negative, or steps not a positive number.
     """
 
     seed: int = 0
@@ -43,4 +44,4 @@ class Run:
     steps: int | None = None
 
     def __post_init__(self) -> None:
-        at_least_one(restarts=self.restarts, steps=self.steps, workers=self.workers)
+        at_least_one(restarts=self.restarts or None, steps=self.steps, workers=self.workers)

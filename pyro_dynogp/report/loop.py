@@ -26,8 +26,6 @@ from pyro_dynogp.support.parallel import one_thread, parallel_map
 if TYPE_CHECKING:
     from pyro_dynogp.fitting import Fit
 
-# Fresh starts of the last fits, of linear models and of cascades.
-LAST_LINEAR_STARTS, LAST_CASCADE_STARTS = 2, 1
 # Of cascades where the fit of block A begins anew.
 FRESH_CASCADE_STARTS = 4
 
@@ -144,7 +142,7 @@ def _names(fit: Fit, record: Record, candidates: Sequence[str] | Record | None) 
 def _final(
     fits: Sequence[Fit], given: Fit, record: Record, workers: int | None, progress: bool
 ) -> list[Fit]:
-    """Models of block A fitted to A and B, from what they have learnt and from fresh starts.
+    """Models of block A fitted to A and B, from what they have learnt.
 
     Refits of the search are posterior modes; here the posterior is of the kind that the given fit
     has, and at least that of static functions is wanted.
@@ -152,10 +150,9 @@ def _final(
 
     def refitted(found: Fit) -> Fit:
         model = replace(found.model, scaling=None)
-        restarts = LAST_LINEAR_STARTS if model.is_linear else LAST_CASCADE_STARTS
         return fit_model(
-            model, record, start=found, restarts=restarts, seed=found.seed, workers=1,
-            progress=False, **_method_of(given, model),
+            model, record, start=found, restarts=0, seed=found.seed, workers=1, progress=False,
+            **_method_of(given, model),
         )  # fmt: skip
 
     return parallel_map(refitted, fits, workers=workers, progress=progress, description="last fits")

@@ -21,6 +21,7 @@ from pyro_dynogp.inference.optimise.maximum import EFFORT, Effort, Optimizer, Op
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.plans import (
+    Plan,
     Values,
     leading_layers,
     linear_twin,
@@ -161,6 +162,11 @@ def optimizer_for(model: Model) -> Optimizer:
     return "adam" if model.has_function and not model.has_feedback else "lbfgs"
 
 
+def optimizer_near(model: Model) -> Optimizer:
+    """The optimizer that goes on from near an optimum."""
+    return "gauss-newton" if has_innovations(model) else "preconditioned"
+
+
 def best_optima(
     problem: Problem, run: Run, optimizer: Optimizer | None, steps: int | None
 ) -> list[Optimum]:
@@ -174,16 +180,24 @@ def best_optima(
         ValueError: where no start leads to a point with a density.
     """
     model, records, learnt = problem.model, problem.records, problem.learnt
-    optimizer = optimizer or optimizer_for(model)
-    if model.is_linear:
+    if learnt is not None and run.restarts == 0:
+        optimizer = optimizer or optimizer_near(model)
+        with seeded(run.seed):  # what has no typical value is drawn
+            start = starting_point(model, records, Plan(None, None, False, run.seed))
+        optima = maximise(
+            problem.target, records, [grown(learnt, start)], run, optimizer=optimizer,
+            steps=steps or STEPS[optimizer], effort=Effort(near=True),
+        )  # fmt: skip
+    elif model.is_linear:
+        optimizer = optimizer or optimizer_for(model)
         starts = linear_starts(model, records, run.restarts, run.seed)
         if learnt is not None:
             starts = [grown(learnt, starts[0]), *starts]
         steps = steps or STEPS[optimizer]
         optima = maximise(problem.target, records, starts, run, steps=steps, optimizer=optimizer)
     else:
-        steps = steps or 600
-        optima = cascade_optima(problem, run, optimizer, steps)
+        optimizer = optimizer or optimizer_for(model)
+        optima = cascade_optima(problem, run, optimizer, steps or 600)
     if optima[0].energy >= WALL:
         raise ValueError(
             "fit: no start reached a point where the likelihood can be evaluated. Check the "
