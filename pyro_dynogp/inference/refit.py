@@ -18,7 +18,6 @@ from pyro_dynogp.inference.methods.mode import (
     climb,
     louder,
     optimizer_near,
-    starting_points,
 )
 from pyro_dynogp.inference.methods.nuts import sample_posterior
 from pyro_dynogp.inference.methods.optima import POLISH, Hyperparameters, posterior_of
@@ -39,9 +38,8 @@ from pyro_dynogp.support.parallel import seeded
 
 # Iterations from the old optima, and of Adam and SVI where they are of a model with functions.
 SAME_STEPS, ADAM_STEPS, SVI_STEPS = 300, 200, 400
-# Iterations of extended models: linear, others of the same layers, with a layer more; fresh starts
-# of the last.
-LINEAR_STEPS, LAYERED_STEPS, ADDED_STEPS, FRESH = 100, 100, 300, 2
+# Iterations of extended models: linear, others of the same layers, with a layer more.
+LINEAR_STEPS, LAYERED_STEPS, ADDED_STEPS = 100, 100, 300
 # Of the same model every start goes on, near its optimum; of a linear one that is extended half of
 # them do, side by side, as processors are kept busy by other trials.
 AGAIN = Effort(kept=1.0, rate=0.004, near=True)
@@ -166,9 +164,9 @@ def _again(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
 def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     """Optima of a model that extends that of a fit.
 
-    With a layer more Adam climbs, as in a first fit, also from fresh starts: better optimisers find
-    modes that fit the noise (a function that is flat where outputs repeat), and what is learnt
-    without an input function may be too far from what is right with it.
+    With a layer more Adam climbs, as in a first fit: better optimisers get to modes of a free
+    function that fit the noise (one that is flat where outputs repeat) and of which its special
+    cases have none, so that gains would be those of climbs.
 
     Process noise that has explained what the smaller model lacks keeps the larger one from
     explaining it: one climb goes without any first, and takes that of a fresh start then.
@@ -187,10 +185,8 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
             return climbed(target, [_best(problem, starts)], run.steps)
         return climbed(target, starts, LINEAR_STEPS)
     if len(target.layers) > len(fit.model.layers):
-        steps = run.steps or ADDED_STEPS
-        fresh = starting_points(target, records, run, count=FRESH, steps=min(LINEAR_STEPS, steps))
-        return climb(target, records, [*starts, *fresh], [], run, steps=steps, optimizer="adam",
-                     effort=EXTENDED)  # fmt: skip
+        return climb(target, records, starts, [], run, steps=run.steps or ADDED_STEPS,
+                     optimizer="adam", effort=EXTENDED)  # fmt: skip
     quiet = without_noise_below_functions(target)
     if quiet != target:
         best = climbed(quiet, [louder(start) for start in starts], LAYERED_STEPS)[0]
