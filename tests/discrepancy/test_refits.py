@@ -12,9 +12,16 @@ from pyro_dynogp import effects
 from pyro_dynogp.data.channels import Delayed, Recorded, Trend
 from pyro_dynogp.discrepancy.search import candidates_of
 from pyro_dynogp.inference import refit as refits
+from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.refit import energy, race, refit
 from pyro_dynogp.inference.run import Run
-from pyro_dynogp.models.variants import with_channel, without_process_noise
+from pyro_dynogp.inference.starts.extended import extended_starts
+from pyro_dynogp.models.variants import (
+    with_channel,
+    with_output_function,
+    without_process_noise,
+)
 from tests.discrepancy.made import SETTINGS, coloured, fitted_mode
 from tests.discrepancy.plant_dynamics import System, response
 from tests.discrepancy.test_decision import spoken_for, two_inputs
@@ -73,6 +80,44 @@ def test_those_behind_take_only_the_first_steps(monkeypatch, record, base):
     first, more = refits.FIRST_STEPS[0], refits.MORE_STEPS[0]
     assert taken == [(False, first)] * 8 + [(True, more)] * refits.FEWEST
     assert all(len(one.history) <= first for one in found[refits.FEWEST :])
+
+
+def climbs_of(monkeypatch, name):
+    """Optimizer and starts of every call of a climb of `refits`."""
+    calls, climb = [], getattr(refits, name)
+
+    def noted(model, records, starts, *args, **options):
+        calls.append((options["optimizer"], starts))
+        return climb(model, records, starts, *args, **options)
+
+    monkeypatch.setattr(refits, name, noted)
+    return calls
+
+
+def test_with_steps_the_most_probable_start_of_a_linear_model_climbs_alone(
+    monkeypatch, record, base
+):
+    calls = climbs_of(monkeypatch, "maximise")
+    model = later(LATE)
+    problem = Problem.of(model, record)
+    starts, _ = extended_starts(base, problem.model, problem.records, 0)
+    monkeypatch.setattr(refits, "extended_starts", lambda *given: (starts[::-1], starts[0]))
+    potential = Potential(problem.target, (problem.records,), starts[0])
+    # The base has learnt its gains without the delay: least squares are nearer.
+    assert potential.log_joint(starts[0]) > potential.log_joint(starts[-1]) + 10.0
+    refit(base, record, model=model, run=replace(RUN, steps=1))
+    ((optimizer, (start,)),) = calls
+    assert optimizer == "gauss-newton"
+    assert start is starts[0]
+    refit(base, record, model=model, run=RUN)
+    assert len(calls[1][1]) == len(starts)
+
+
+def test_a_function_more_is_climbed_by_adam_from_what_is_learnt(monkeypatch, record, base):
+    calls = climbs_of(monkeypatch, "climb")
+    refit(base, record, model=with_output_function(MODEL), run=replace(RUN, steps=2))
+    ((optimizer, starts),) = calls
+    assert (optimizer, len(starts)) == ("adam", 2)
 
 
 def test_what_cannot_be_fitted_is_said(record, base):
