@@ -16,6 +16,7 @@ from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.mode import (
     at_optimum,
     climb,
+    linear_starts,
     louder,
     optimizer_near,
 )
@@ -168,6 +169,9 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     function that fit the noise (one that is flat where outputs repeat) and of which its special
     cases have none, so that gains would be those of climbs.
 
+    A linear model with more pairs has the starts of a first fit, too: what is new may take the
+    place of what is learnt.
+
     Process noise that has explained what the smaller model lacks keeps the larger one from
     explaining it: one climb goes without any first, and takes that of a fresh start then.
     """
@@ -183,7 +187,9 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     if target.is_linear:
         if run.steps:
             return climbed(target, [_best(problem, starts)], run.steps)
-        return climbed(target, starts, LINEAR_STEPS)
+        more = target.dynamic[0][1].pairs > fit.model.dynamic[0][1].pairs
+        fresh = linear_starts(target, records, None, run.seed) if more else []
+        return climbed(target, [*fresh, *starts], LINEAR_STEPS)
     if len(target.layers) > len(fit.model.layers):
         return climb(target, records, starts, [], run, steps=run.steps or ADDED_STEPS,
                      optimizer="adam", effort=EXTENDED)  # fmt: skip
