@@ -28,7 +28,7 @@ from pyro_dynogp.prediction import predict as _predict
 from pyro_dynogp.prediction.first_state import beginning
 from pyro_dynogp.prediction.layers import LayerTrajectory, StaticBand
 from pyro_dynogp.prediction.prediction import Prediction
-from pyro_dynogp.support.errors import instance, warn
+from pyro_dynogp.support.errors import instance, invalid, warn
 
 __all__ = ["Fit", "fit", "load"]
 
@@ -226,7 +226,8 @@ def fit(
             model that this one extends (what sites have in common is taken over).
         seed: the same seed gives the same numbers to the last bit on one machine.
         restarts: number of starting points (default 8 with static layers; 2 of `Trajectories`; else
-            6 with random poles and, on equal steps, up to 6 of subspace identification).
+            6 with random poles and, on equal steps, up to 6 of subspace identification); 0 for
+            `start` alone.
         steps: most iterations of a start (default 100 of Gauss-Newton; 500 of L-BFGS; Adam 1500;
             cascades 600) and, with "svi", of SVI (default 1000; with static layers 60, and no more
             while hyperparameters stay at the optimum, around which it begins all but normal).
@@ -247,6 +248,8 @@ def fit(
         known_fit(start, "start")
     chosen = method_of(method, model, options)
     run = Run(seed, workers, progress, restarts=restarts, steps=steps)
+    if restarts == 0 and start is None:
+        raise invalid("restarts", expected="a whole number >= 1 without a start", got="0")
     chosen.check(model, warm=start is not None)
     problem = Problem.of(model, record, start)
     fitted = Fit.of(train_model(problem, chosen, run, checkpoint))

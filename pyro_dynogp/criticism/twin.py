@@ -116,13 +116,7 @@ def twin_findings(
 
 def _first(fit: Fitted, samples: int) -> list[Record]:
     """The first samples of the training record; of several records, the same share of each."""
-    if not fit.collapsed:
-        raise invalid(
-            "twin",
-            expected="False for a fit with trajectories as sites",
-            got=repr(samples),
-            advice="NUTS needs them integrated out: fit with guide='collapsed' to compare.",
-        )
+    fit.check_collapsed()
     if fit.method == "nuts":
         raise invalid(
             "twin", expected="False for a fit by NUTS, which is what others are held against",

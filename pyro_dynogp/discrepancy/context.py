@@ -13,11 +13,13 @@ from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.blocks import Blocks, shared
 from pyro_dynogp.discrepancy.decision import Confirmed, certain, confirm
-from pyro_dynogp.discrepancy.refits import quick_fit
 from pyro_dynogp.discrepancy.residuals import residuals_of
 from pyro_dynogp.discrepancy.search import Found, look, rated
 from pyro_dynogp.discrepancy.trials import forecast_density, forecast_errors, without
 from pyro_dynogp.effects import Effect
+from pyro_dynogp.inference.refit import refit
+from pyro_dynogp.inference.run import Run
+from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.variants import (
     used_channels,
     with_process_noise,
@@ -148,7 +150,12 @@ class SearchContext:
         model = without_process_noise(fit.model)
         if model == fit.model:
             return fit
-        return quick_fit(model, without(self.data.known, self.held_out), self.seed, fit)
+        return self.refit(fit, model)
+
+    def refit(self, fit: Fit, model: Model) -> Fit:
+        """Mode of a model that extends that of a fit, on what is not held out."""
+        training = without(self.data.known, self.held_out)
+        return refit(fit, training, model=model, run=Run(self.seed, workers=1))
 
     def hiding(self, fit: Fit, plain: Fit) -> str:
         """In words, that the model forecasts held-out data better without its process noise.
@@ -178,8 +185,7 @@ class SearchContext:
 
     def with_process_noise(self, fit: Fit) -> Fit | None:
         """Fit with process noise, to the same data; None where that costs forecasts still."""
-        training = without(self.data.known, self.held_out)
-        noisy = quick_fit(with_process_noise(fit.model), training, self.seed, fit)
+        noisy = self.refit(fit, with_process_noise(fit.model))
         return None if self.hiding(noisy, fit) else noisy
 
     def confirm(self, chosen: Any, current: Fit, number: int) -> Confirmed:

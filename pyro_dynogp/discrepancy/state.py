@@ -10,10 +10,8 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.context import SearchContext, Stopwatch, Tested
 from pyro_dynogp.discrepancy.data_faults import data_spikes
 from pyro_dynogp.discrepancy.decision import Confirmed
-from pyro_dynogp.discrepancy.refits import quick_fit
 from pyro_dynogp.discrepancy.result import Attempt
 from pyro_dynogp.discrepancy.search import Candidate, Found, candidates_of
-from pyro_dynogp.discrepancy.trials import without
 from pyro_dynogp.effects.base import OUTSIDE
 from pyro_dynogp.models.variants import Model, has_process_noise
 from pyro_dynogp.statistics.evidence import Residuals
@@ -192,8 +190,7 @@ class SearchState:
         again = rounds.hold_out_less(winner)
         fit = confirmed.fit
         if fit is None or again:
-            training = without(rounds.data.known, rounds.held_out)
-            fit = quick_fit(larger, training, rounds.seed, self.current)
+            fit = rounds.refit(self.current, larger)
         if self.quiet and (noisy := rounds.with_process_noise(fit)) is not None:
             fit, self.quiet = noisy, False
         self._go_on_from(fit)

@@ -11,9 +11,10 @@ from scipy.special import logsumexp
 
 from pyro_dynogp.criticism.densities import pointwise_log_density
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.discrepancy.refits import energy, poles_of, quick_fit, race
 from pyro_dynogp.effects.base import Compared, Score
 from pyro_dynogp.fitting import Fit
+from pyro_dynogp.inference.refit import energy, race, refit
+from pyro_dynogp.inference.run import Run
 from pyro_dynogp.models.delays import comparable
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.variants import Model
@@ -49,6 +50,11 @@ class Trial:
     compared: Compared = "training"
     fit: Fit | None = None
 
+    @property
+    def run(self) -> Run:
+        """How refits are run: trials share the processors."""
+        return Run(self.seed, workers=1)
+
 
 @dataclass(frozen=True, eq=False)
 class Tried:
@@ -83,7 +89,7 @@ def run(trial: Trial) -> Tried:
             found = first
             if index > 0:
                 rest = without(trial.record, fold)
-                found = quick_fit(_unscaled(first), rest, trial.seed, trial.base)
+                found = refit(trial.base, rest, model=first.model, run=trial.run)
             parts.append(held_out_density(found, trial.record, fold, trial.score))
             if trial.score == "one step":
                 beside.append(forecast_errors(found, trial.record, fold)[0][fold])
@@ -105,20 +111,19 @@ def _kept(trial: Trial, training: Record) -> Fit:
         return trial.fit
     if len(trial.models) > 1 and trial.compared == "held out":
         return _best_ahead(trial, training)
-    base = trial.base
-    (model, *others), start = trial.models, base
+    (model, *others), start = trial.models, trial.base
     finer = _finer(trial, model, training, 0)
     if others or finer:
         same = comparable(training, [*trial.models, *finer], trial.settings.reach)
-        found, problems = race(trial.models, same, base, trial.seed)
+        found, problems = race(trial.base, trial.models, same, trial.run)
         if not found:
             raise ValueError(problems[0])
         start = found[0]
         for times in range(trial.settings.refinements):
             finer = _finer(trial, _unscaled(start), training, times)
-            start = min([start, *race(finer, same, start, trial.seed)[0]], key=energy)
-        model = _unscaled(start)
-    return quick_fit(model, training, trial.seed, start, poles=poles_of(base))
+            start = min([start, *race(start, finer, same, trial.run)[0]], key=energy)
+        model = start.model
+    return refit(start, training, model=model, run=trial.run)
 
 
 def _finer(trial: Trial, model: Model, training: Record, times: int) -> Sequence[Model]:
@@ -128,7 +133,7 @@ def _finer(trial: Trial, model: Model, training: Record, times: int) -> Sequence
 
 def _best_ahead(trial: Trial, training: Record) -> Fit:
     """The first variant that does as well as the best on the data held out."""
-    fits = [quick_fit(model, training, trial.seed, trial.base) for model in trial.models]
+    fits = [refit(trial.base, training, model=model, run=trial.run) for model in trial.models]
     sums = [held_out_density(f, trial.record, trial.folds[0], trial.score).sum() for f in fits]
     least = max(sums) - trial.settings.gain
     return next(f for f, total in zip(fits, sums, strict=True) if total >= least)

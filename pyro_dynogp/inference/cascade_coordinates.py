@@ -75,12 +75,10 @@ class StraightPotential(Potential):
         """Coordinates (*s, d) to constrained values (*s, *shape) of every site."""
         return super().unpack(self._unconstrained(x)[0])
 
-    def energy(
-        self, z: Tensor, *, jacobian: bool, inputs: Sequence[Tensor] | None = None
-    ) -> Tensor:
+    def energy(self, z: Tensor, *, jacobian: bool) -> Tensor:
         """-log density at z (d,): of the values, or with `jacobian` of the coordinates."""
         plain, log_det = self._unconstrained(z)
-        energy = super().energy(plain, jacobian=jacobian, inputs=inputs)
+        energy = super().energy(plain, jacobian=jacobian)
         return energy - log_det if jacobian else energy
 
     def _unconstrained(self, x: Tensor) -> tuple[Tensor, Tensor]:

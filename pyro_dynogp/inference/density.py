@@ -53,11 +53,10 @@ def joint_energy(
     z: Tensor,
     *,
     jacobian: bool,
-    inputs: Sequence[Tensor] | None = None,
 ) -> Tensor:
     """-log p(y, values) at the unconstrained vector z (d,), or (k,) at vectors z (k, d) together.
 
-    With `jacobian` the density is that of the unconstrained vector. `inputs` as of `LogJoint`.
+    With `jacobian` the density is that of the unconstrained vector.
     """
     values: dict[str, Tensor] = {}
     log_jacobian = torch.zeros(z.shape[:-1], dtype=torch.float64)
@@ -67,27 +66,23 @@ def joint_energy(
         if jacobian:
             each = site.transform.log_abs_det_jacobian(part, value)
             log_jacobian = log_jacobian + each.reshape(*z.shape[:-1], -1).sum(-1)
-    return -log_joint(values, None if z.dim() == 1 else len(z), inputs) - log_jacobian
+    return -log_joint(values, None if z.dim() == 1 else len(z)) - log_jacobian
 
 
-def each_with_gradient(
-    energy: Callable[..., Tensor], z: Tensor, *more: Tensor
-) -> tuple[Tensor, Tensor]:
+def each_with_gradient(energy: Callable[[Tensor], Tensor], z: Tensor) -> tuple[Tensor, Tensor]:
     """Energies (k,) at z (k, d) and their gradients (k, d), infinite and zero where there are none.
 
-    Where one point breaks the evaluation of all, it is found by halving. The energy is called with
-    z and with `more` (k, ...), a row for each point.
+    Where one point breaks the evaluation of all, it is found by halving.
     """
     x = z.detach().requires_grad_()
     try:
         with torch.enable_grad(), pyro.validation_enabled(False), denormals_flushed():
-            value = energy(x, *more)
+            value = energy(x)
             (gradient,) = torch.autograd.grad(value.sum(), x)
     except (NotPositiveDefiniteError, torch.linalg.LinAlgError, ValueError):
         if len(z) == 1:
             return torch.full((1,), torch.inf, dtype=torch.float64), torch.zeros_like(z)
-        split = zip(*(one.tensor_split(2) for one in (z, *more)), strict=True)
-        halves = [each_with_gradient(energy, *half) for half in split]
+        halves = [each_with_gradient(energy, half) for half in z.tensor_split(2)]
         return torch.cat([v for v, _ in halves]), torch.cat([g for _, g in halves])
     bad = ~(torch.isfinite(value) & torch.isfinite(gradient).all(-1))
     return value.detach().masked_fill(bad, torch.inf), gradient.masked_fill(bad[:, None], 0.0)
@@ -166,15 +161,12 @@ class Potential:
         """Log p(y, values), of constrained values."""
         return self.log_density(values, None)
 
-    def energy(
-        self, z: Tensor, *, jacobian: bool, inputs: Sequence[Tensor] | None = None
-    ) -> Tensor:
+    def energy(self, z: Tensor, *, jacobian: bool) -> Tensor:
         """-log density at z (d,) or, of a model that takes batches, (k,) at z (k, d).
 
-        Of the values, or with `jacobian` of the unconstrained vector. With `inputs`, for each
-        record (k, n, n_u) or (n, n_u), each point has inputs of its own.
+        Of the values, or with `jacobian` of the unconstrained vector.
         """
-        return joint_energy(self.log_density, self.sites, z, jacobian=jacobian, inputs=inputs)
+        return joint_energy(self.log_density, self.sites, z, jacobian=jacobian)
 
     def value_and_gradient(
         self, z: np.ndarray, *, jacobian: bool = False
@@ -188,23 +180,20 @@ class Potential:
         return float(values[0]), gradients[0]
 
     def values_and_gradients(
-        self, z: np.ndarray, *, jacobian: bool = False, inputs: Sequence[Tensor] | None = None
+        self, z: np.ndarray, *, jacobian: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
         """Energies (k,) and their gradients (k, d) at z (k, d), as `value_and_gradient` has them.
 
-        A model that takes batches is evaluated at `width` points at once. `inputs` as of `energy`.
+        A model that takes batches is evaluated at `width` points at once.
         """
 
-        def energy(x: Tensor, *u: Tensor) -> Tensor:
-            one = len(x) == 1
-            given = [each[0] if one else each for each in u] or None
-            if one:
-                return self.energy(x[0], jacobian=jacobian, inputs=given)[None]
-            return self.energy(x, jacobian=jacobian, inputs=given)
+        def energy(x: Tensor) -> Tensor:
+            if len(x) == 1:
+                return self.energy(x[0], jacobian=jacobian)[None]
+            return self.energy(x, jacobian=jacobian)
 
         points = torch.tensor(z, dtype=torch.float64)
-        batches = zip(*(one.split(self.width) for one in (points, *(inputs or ()))), strict=True)
-        found = [each_with_gradient(energy, *batch) for batch in batches]
+        found = [each_with_gradient(energy, batch) for batch in points.split(self.width)]
         values = torch.cat([value for value, _ in found]).numpy()
         values[np.isinf(values)] = WALL
         return values, torch.cat([gradient for _, gradient in found]).numpy()

@@ -154,11 +154,31 @@ class Fitted:
         return self.history if self.method == "svi" else -self.history
 
     def at_mode(self) -> Self:
-        """The same fit with its posterior mode in place of its draws."""
+        """The same fit with its posterior mode in place of its draws.
+
+        Raises:
+            ValueError: where trajectories were sites: the middle of that posterior is not the mode
+                of the parameters with trajectories integrated out.
+        """
+        self.check_collapsed()
         if self.method == "map":
             return self
         draws = FrozenMapping({name: value.unsqueeze(0) for name, value in self.mode.items()})
         return replace(self, posterior=Mixture.at(self.mode), draws=draws)
+
+    def check_collapsed(self) -> None:
+        """Refuse a fit with trajectories as sites.
+
+        Raises:
+            ValueError: on such a fit.
+        """
+        if not self.collapsed:
+            raise invalid(
+                "fit",
+                expected="a fit whose trajectories are integrated out",
+                got="one with trajectories as sites, whose guide belongs to its record",
+                advice="Fit with guide='collapsed' or method='map', or do without refits.",
+            )
 
     def with_draws(self, values: Mapping[str, Tensor]) -> Self:
         """The fit with other draws (S, *shape), for what is computed from draws alone."""

@@ -30,14 +30,11 @@ Latent = tuple[str, Distribution, Tensor]
 class LogJoint(Protocol):
     """Log p(y, values) [nats] as a function of constrained values of every site."""
 
-    def __call__(
-        self, values: Values, count: int | None, inputs: Sequence[Tensor] | None = None
-    ) -> Tensor:
+    def __call__(self, values: Values, count: int | None) -> Tensor:
         """Density () at values (*shape), or (count,) at values (count, *shape) of every site.
 
         Args:
             values: of every latent site. count: how many of each; None for one, without dimension.
-            inputs: for each record u (count, n, n_u) [input] in place of its own.
         """
 
     def latent(self, values: Values) -> tuple[list[Latent], int]:
@@ -54,11 +51,10 @@ class Traced:
     def __init__(self, model: Program, args: Arguments) -> None:
         self.model, self.args = model, args
 
-    def trace(self, values: Values, inputs: Sequence[Tensor] | None = None) -> Any:
+    def trace(self, values: Values) -> Any:
         """Trace of the model conditioned on values."""
-        args = self.args if inputs is None else (*self.args, inputs)
         conditioned = pyro.poutine.condition(self.model, data=dict(values))
-        return pyro.poutine.trace(conditioned).get_trace(*args)
+        return pyro.poutine.trace(conditioned).get_trace(*self.args)
 
     def latent(self, values: Values) -> tuple[list[Latent], int]:
         """See `LogJoint`."""
@@ -68,11 +64,9 @@ class Traced:
         observed = [node["value"] for node in nodes if node["name"] not in values]
         return found, sum(y.numel() for y in observed if torch.is_tensor(y))
 
-    def __call__(
-        self, values: Values, count: int | None, inputs: Sequence[Tensor] | None = None
-    ) -> Tensor:
+    def __call__(self, values: Values, count: int | None) -> Tensor:
         """See `LogJoint`."""
-        trace = self.trace(values, inputs)
+        trace = self.trace(values)
         trace.compute_log_prob()
         total: Tensor = trace.log_prob_sum() if count is None else log_prob_by_draw(trace, count)
         return total
@@ -149,25 +143,20 @@ class Direct:
         found = [(site.name, site.prior, values[site.name].detach()) for site in self.sites]
         return found, sum(y.numel() for y in self.observations)
 
-    def outputs(
-        self, values: Values, inputs: Sequence[Tensor] | None = None
-    ) -> list[OutputProcess]:
+    def outputs(self, values: Values) -> list[OutputProcess]:
         """Distribution of the outputs of each record at values (*b, *shape) of every site."""
         model, found = self.model, []
         system = model.system(values, self.records[0].scaling)
         for index, record in enumerate(self.records):
             suffix = "" if len(self.records) == 1 else f"_{index}"
             here = model.begin(system, model.states_of(values, suffix))
-            along = record if inputs is None else record.with_inputs(inputs[index])
-            found.append(output_process(here, along))
+            found.append(output_process(here, record))
         return found
 
-    def __call__(
-        self, values: Values, count: int | None, inputs: Sequence[Tensor] | None = None
-    ) -> Tensor:
+    def __call__(self, values: Values, count: int | None) -> Tensor:
         """See `LogJoint`."""
         total = self.prior.log_prob(values)
-        each = zip(self.outputs(values, inputs), self.observations, self._at_limits, strict=True)
+        each = zip(self.outputs(values), self.observations, self._at_limits, strict=True)
         for outputs, y, at in each:
             total = total + outputs.log_prob(y)
             if at.any():

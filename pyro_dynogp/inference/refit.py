@@ -1,97 +1,125 @@
-"""The same fit on other data of the same system: from its optima, with its scaling and priors."""
+"""Fits made again: the same model on other data, or one that extends it, from what is learnt."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
+import numpy as np
 import torch
-from torch import Tensor
 
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.methods.base import Problem
+from pyro_dynogp.inference.methods.mode import at_optimum, climb, louder
 from pyro_dynogp.inference.methods.nuts import sample_posterior
 from pyro_dynogp.inference.methods.optima import POLISH, Hyperparameters, posterior_of
 from pyro_dynogp.inference.methods.svi import Schedule
+from pyro_dynogp.inference.optimise.gauss_newton import has_innovations
 from pyro_dynogp.inference.optimise.maximum import Effort, Optimum, maximise
 from pyro_dynogp.inference.posteriors import Mixture, Sampled, draws_of_guide
 from pyro_dynogp.inference.run import Run
-from pyro_dynogp.inference.starts.plans import optimizer_for
-from pyro_dynogp.models.prepared import as_measured
+from pyro_dynogp.inference.starts.dynamic import Values
+from pyro_dynogp.inference.starts.extended import extended_starts
+from pyro_dynogp.inference.starts.plans import linear_starts, optimizer_near
+from pyro_dynogp.inference.starts.poles import grown
+from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
+from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.variants import without_noise_below_functions
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import seeded
 
-# Most iterations from the old optimum: of linear models, of Adam, of SVI for all sites.
-LINEAR_STEPS, CASCADE_STEPS, SVI_STEPS = 300, 200, 400
-# Adam's first step: the old optimum is close by.
-REFIT_RATE = 0.004
-FittedKind = TypeVar("FittedKind", bound=Fitted)
+# Iterations from the old optima, and of Adam and SVI where they are of a model with functions.
+SAME_STEPS, ADAM_STEPS, SVI_STEPS = 300, 200, 400
+# Iterations of extended models: linear, others of the same layers, with a layer more.
+LINEAR_STEPS, LAYERED_STEPS, ADDED_STEPS = 100, 100, 300
+# Of the same model every start goes on, near its optimum; of a linear one that is extended half of
+# them do, side by side, as processors are kept busy by other trials.
+AGAIN = Effort(kept=1.0, rate=0.004, near=True)
+EXTENDED = Effort(kept=1 / 2, together=8)
+# Iterations of all variants of an effect, by Gauss-Newton and of others, and more of the leading
+# ones: this share, three at least.
+FIRST_STEPS, MORE_STEPS = (2, 8), (12, 32)
+LEADING, FEWEST = 1 / 5, 3
 # Of NUTS, whose chains start at the mode.
 WARMUP = 300
+FittedKind = TypeVar("FittedKind", bound=Fitted)
 
 
-def refit(fit: FittedKind, records: Record | Sequence[Record]) -> FittedKind:
-    """Fit again by the same method, beginning at the optima of the old fit, in this process.
+def refit(
+    fit: FittedKind,
+    records: Record | Sequence[Record],
+    *,
+    model: Model | None = None,
+    run: Run | None = None,
+) -> FittedKind:
+    """Fit again by the same method, beginning at what a fit has learnt.
 
-    The scaling, and with it every prior, stays that of the old fit: what changes is the data alone.
+    The same model keeps its scaling, and with it every prior: what changes is the data alone. A
+    model that extends it gets the units of the new records, and starts where nothing that is new
+    does anything yet. `fit.at_mode()` gives a mode again, whatever the method was.
 
     Args:
-        fit: the old fit. records: as many as it has, each with the same channels.
+        fit: the old fit.
+        records: one or several; of the same model as many as it has, with the same channels.
+        model: that extends the one of the fit, or that one again in other units; None for the same.
+        run: steps are those of each start, of which a linear model has one where they are given;
+            by default with the seed of the fit, in this process.
 
     Raises:
-        ValueError: on a fit with trajectories as sites, whose guide belongs to its record, or on
-            another number of records.
+        ValueError: on a fit with trajectories as sites, whose guide belongs to its record, on
+            another number of records, or where records do not fit the model.
     """
+    run = run or Run(fit.seed, workers=1)
     several = (records,) if isinstance(records, Record) else tuple(records)
-    if not fit.collapsed:
-        raise invalid(
-            "fit",
-            expected="a fit whose trajectories are integrated out",
-            got="one with trajectories as sites, whose guide belongs to its record",
-            advice="Fit with guide='collapsed', or do without refits.",
-        )
+    fit.check_collapsed()
+    if model is not None:
+        problem = _problem(model, several)
+        return _posterior(fit, problem, _extended(fit, problem, run), run)
     if len(several) != len(fit.records):
         raise invalid("records", expected=f"{len(fit.records)}, as before", got=str(len(several)))
     problem = Problem(fit.model, fit.model.prepare(several))
-    run = Run(fit.seed, workers=1)
-    cascade, optimizer = fit.model.has_function, optimizer_for(fit.model)
-    optima = maximise(
-        problem.target,
-        problem.records,
-        optima_of(fit),
-        run,
-        optimizer=optimizer,
-        steps=CASCADE_STEPS if cascade else LINEAR_STEPS,
-        effort=Effort(kept=1.0, rate=REFIT_RATE),
-    )
-    best = optima[0]
-    changed: dict[str, Any] = {
-        "mode": FrozenMapping(best.values),
-        "history": best.history,
-        "records": as_measured(problem.records),
-    }
-    if fit.method == "map":
-        draws = {name: value.unsqueeze(0) for name, value in best.values.items()}
-        changed |= {"posterior": Mixture.at(best.values), "draws": FrozenMapping(draws)}
-        return replace(fit, **changed)
-    if fit.method == "nuts":
-        sampled = FrozenMapping(_sampled(fit, problem, best, run))
-        return replace(fit, posterior=Sampled(sampled), draws=sampled, **changed)
-    family = family_of(fit)
-    schedule = Schedule(POLISH if family == "map" else SVI_STEPS)
-    found = posterior_of(problem, optima, family, run, schedule)
-    changed |= {"mode": FrozenMapping(found.mode), "history": found.elbo}
-    count = len(next(iter(fit.draws.values())))
-    with seeded(fit.seed):
-        drawn = draws_of_guide(found.guide, count)
-    draws = {name: drawn[name] for name in best.values}
-    return replace(fit, draws=FrozenMapping(draws), posterior=found.guide, **changed)
+    return _posterior(fit, problem, _again(fit, problem, run), run)
 
 
-def optima_of(fit: Fitted) -> list[dict[str, Tensor]]:
+def race(
+    fit: FittedKind, models: Sequence[Model], record: Record, run: Run
+) -> tuple[list[FittedKind], list[str]]:
+    """Variants that extend a mode, the most probable first, and why others could not be fitted.
+
+    All take a few steps from what the fit has learnt, the leading ones more: a variant that is
+    far behind after the first (they differ by tens to hundreds of nats) hardly ever wins.
+
+    Args:
+        fit: a mode. models: that extend its model. record: training record. run: its seed counts.
+    """
+    found: list[FittedKind] = []
+    problems: list[str] = []
+
+    def after(steps: tuple[int, int], model: Model) -> Run:
+        newton, other = steps
+        return replace(run, steps=newton if has_innovations(model) else other, workers=1)
+
+    for model in models:
+        try:
+            found.append(refit(fit, record, model=model, run=after(FIRST_STEPS, model)))
+        except ValueError as error:  # for instance a channel that is constant there
+            problems.append(str(error))
+    found.sort(key=energy)
+    cut = max(FEWEST, round(LEADING * len(found)))
+    further = [refit(f, f.records, run=after(MORE_STEPS, f.model)) for f in found[:cut]]
+    return sorted([*further, *found[cut:]], key=energy), problems
+
+
+def energy(fit: Fitted) -> float:
+    """-log p(y, values) at the mode [nats]."""
+    return float(fit.start_energies[0])
+
+
+def optima_of(fit: Fitted) -> list[Values]:
     """Values of all sites at each optimum that a fit consists of, the leading one first."""
     posterior = fit.posterior
     if isinstance(posterior, Mixture) and posterior.points and posterior.sites:
@@ -109,15 +137,94 @@ def family_of(fit: Fitted) -> Hyperparameters:
     return "normal" if independent else "multivariate normal"
 
 
-def _sampled(fit: Fitted, problem: Problem, best: Optimum, run: Run) -> dict[str, Tensor]:
-    chains = int(fit.diagnostics["chains"])
-    found = sample_posterior(
-        problem.target,
-        problem.records,
-        best.values,
-        run,
-        chains=chains,
-        draws=len(next(iter(fit.draws.values()))) // chains,
-        warmup=WARMUP,
-    )
-    return {name: value.flatten(0, 1) for name, value in found.draws.items()}
+def _problem(model: Model, records: Sequence[Record]) -> Problem:
+    """A model in the units of records; outputs count where the model knows its inputs."""
+    late = longest_delay(model)
+    return Problem.of(model, [where_inputs_are_known(record, late) for record in records])
+
+
+def _again(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
+    """Optima of the same model: of functions by Adam, as before, but where the mode is wanted.
+
+    Better optimisers leave an optimum of a model with functions along its ridges.
+    """
+    adam = fit.model.has_function and fit.method != "map"
+    steps = run.steps or (ADAM_STEPS if adam else SAME_STEPS)
+    optimizer = "adam" if adam else optimizer_near(fit.model)
+    return maximise(
+        problem.target, problem.records, optima_of(fit), run, optimizer=optimizer, steps=steps,
+        effort=AGAIN,
+    )  # fmt: skip
+
+
+def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
+    """Optima of a model that extends that of a fit.
+
+    With a layer more Adam climbs, as in a first fit: better optimisers get to modes of a free
+    function that fit the noise (one that is flat where outputs repeat) and of which its special
+    cases have none, so that gains would be those of climbs.
+
+    A linear model with more pairs has the starts of a first fit, too: what is new may take the
+    place of what is learnt.
+
+    Process noise that has explained what the smaller model lacks keeps the larger one from
+    explaining it: one climb goes without any first, and takes that of a fresh start then.
+    """
+    target, records = problem.target, problem.records
+    starts, new = extended_starts(fit, problem.model, records, run.seed)
+
+    def climbed(model: Model, points: Sequence[Values], usual: int) -> list[Optimum]:
+        return maximise(
+            model, records, points, run, optimizer=optimizer_near(model), steps=run.steps or usual,
+            effort=EXTENDED,
+        )  # fmt: skip
+
+    if target.is_linear:
+        if run.steps:
+            return climbed(target, [_best(problem, starts)], run.steps)
+        more = target.dynamic[0][1].pairs > fit.model.dynamic[0][1].pairs
+        fresh = linear_starts(target, records, None, run.seed) if more else []
+        return climbed(target, [*fresh, *starts], LINEAR_STEPS)
+    if len(target.layers) > len(fit.model.layers):
+        return climb(target, records, starts, [], run, steps=run.steps or ADDED_STEPS,
+                     optimizer="adam", effort=EXTENDED)  # fmt: skip
+    quiet = without_noise_below_functions(target)
+    if quiet != target:
+        best = climbed(quiet, [louder(start) for start in starts], LAYERED_STEPS)[0]
+        starts = [*starts, grown(best.values, new)]
+    return climbed(target, starts, LAYERED_STEPS)
+
+
+def _best(problem: Problem, starts: Sequence[Values]) -> Values:
+    """The most probable of several starts."""
+    potential = Potential(problem.target, (problem.records,), starts[0])
+    z = np.stack([potential.pack(start).numpy() for start in starts])
+    return starts[int(potential.values_and_gradients(z)[0].argmin())]
+
+
+def _posterior(
+    fit: FittedKind, problem: Problem, optima: Sequence[Optimum], run: Run
+) -> FittedKind:
+    """The posterior around new optima, of the kind that a fit has."""
+    mode = type(fit).of(at_optimum(problem.model, optima, run.seed, problem.records))
+    if fit.method == "map":
+        return mode
+    count = len(next(iter(fit.draws.values())))
+    if fit.method == "nuts":
+        chains = int(fit.diagnostics["chains"])
+        found = sample_posterior(
+            problem.target, problem.records, optima[0].values, run, chains=chains,
+            draws=count // chains, warmup=WARMUP,
+        )  # fmt: skip
+        draws = FrozenMapping({name: x.flatten(0, 1) for name, x in found.draws.items()})
+        return replace(mode, posterior=Sampled(draws), draws=draws, diagnostics=fit.diagnostics)
+    family = family_of(fit)
+    schedule = Schedule(POLISH if family == "map" else SVI_STEPS)
+    fitted = posterior_of(problem, optima, family, run, schedule)
+    with seeded(run.seed):
+        drawn = draws_of_guide(fitted.guide, count)
+    return replace(
+        mode, posterior=fitted.guide, mode=FrozenMapping(fitted.mode), history=fitted.elbo,
+        draws=FrozenMapping({name: drawn[name] for name in mode.mode}),
+        diagnostics=fit.diagnostics,
+    )  # fmt: skip

@@ -15,7 +15,8 @@ class Run:
     Attributes:
         seed: of everything that is drawn. workers: processes, None for all processors.
         progress: whether to show progress bars. checkpoints: where finished pieces are kept.
-        restarts: number of starting points, None for what the method and the model suggest.
+        restarts: number of starting points, None for what the method and the model suggest, 0 for
+            the fit to start from alone.
         steps: most iterations, None for the same.
 
     Raises:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -217,27 +217,24 @@ class Model(Structure):
         """Whether what the inducing values leave open of a static layer is drawn, too."""
         return place.pathwise and self.integrate != "all"
 
-    def __call__(self, records: Records, inputs: Sequence[Tensor] | None = None) -> None:
+    def __call__(self, records: Records) -> None:
         """Run the Pyro model on one record or on several.
 
         Args:
             records: with inputs and outputs; prepared ones are not checked again.
-            inputs: for each record u (k, n, n_u) [input] in place of its own, where every site has
-                k values: each of them with inputs of its own.
         """
         several = self.prepare(records)
         system = self.sample_system(several[0].scaling)
         for index, record in enumerate(several):
             suffix = "" if len(several) == 1 else f"_{index}"
             here = self.begin(system, self.sample_states(suffix))
-            along = record if inputs is None else record.with_inputs(inputs[index])
-            outputs = output_process(here, along)
+            outputs = output_process(here, record)
             if self.integrate == "all":
                 y = record.observations if record.has_outputs else None
                 pyro.sample(f"y{suffix}", outputs, obs=y)
             else:
                 last = self.integrate == "last"
-                observe_explicit(outputs, along, suffix, last_integrated=last)
+                observe_explicit(outputs, record, suffix, last_integrated=last)
             at = at_limits(self.layers, record.record)
             if at.any():
                 pyro.factor(f"at_limits{suffix}", log_probability_scale(at, outputs))

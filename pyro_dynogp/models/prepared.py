@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from torch import Tensor
 
@@ -24,7 +24,7 @@ class PreparedRecord:
         record: with the model's channels as inputs.
         scaling: of the training record.
         grid: its times.
-        inputs: u (*b, n, n_u) float64 [input].
+        inputs: u (n, n_u) float64 [input].
         scaled_inputs: the same in standard deviations of the training record.
         observations: y (n,) of one output, (n, n_y) of several [output]; NaN where missing.
     """
@@ -46,10 +46,6 @@ class PreparedRecord:
     def __len__(self) -> int:
         return len(self.record)
 
-    def with_inputs(self, inputs: Tensor) -> PreparedRecord:
-        """The same times and outputs with other inputs u (*b, n, n_u) [input]."""
-        return replace(self, inputs=inputs, scaled_inputs=_scaled(inputs, self.scaling))
-
     @property
     def has_outputs(self) -> bool:
         """Whether there are outputs at all."""
@@ -67,7 +63,7 @@ Records = Record | Sequence[Record] | Sequence[PreparedRecord]
 
 
 def _scaled(inputs: Tensor, scaling: Scaling) -> Tensor:
-    """Inputs (*b, n, n_u) in standard deviations of the training record."""
+    """Inputs (n, n_u) in standard deviations of the training record."""
     if not inputs.shape[-1]:
         return inputs
     return (inputs - as_tensor(scaling.input_offset)) / as_tensor(scaling.input_scale)

@@ -155,8 +155,7 @@ def pole_map(fit: Fit) -> Figure:
     """
     unit = fit.scaling.time_unit
     draws = _unbatched(fit.modes.poles, fit).ravel()
-    # Constraining a copy to the mode gives the poles there, in the units of the record.
-    best = np.asarray(fit.at_mode().modes.poles)
+    best = np.asarray(fit.system_at(fit.mode).physical(fit.scaling).modes.poles)
     figure, axes = style.panels(1, width=7.6, height=6.2)
     panel = axes[0, 0]
     sampled = fit.method != "map"

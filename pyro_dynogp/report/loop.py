@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.records import one_record
-from pyro_dynogp.discrepancy.blocks import blocks_of
+from pyro_dynogp.discrepancy.blocks import Blocks, blocks_of
 from pyro_dynogp.discrepancy.context import SearchContext, Stopwatch
-from pyro_dynogp.discrepancy.refits import poles_of, quick_fit
 from pyro_dynogp.discrepancy.state import SearchState
 from pyro_dynogp.discrepancy.trials import without
 from pyro_dynogp.effects import CATALOGUE, Effect
@@ -30,8 +29,8 @@ from pyro_dynogp.support.parallel import one_thread, parallel_map
 if TYPE_CHECKING:
     from pyro_dynogp.fitting import Fit
 
-# Fresh starts of the last fits, of linear models and of cascades.
-LAST_LINEAR_STARTS, LAST_CASCADE_STARTS = 2, 1
+# Of cascades where the fit of block A begins anew.
+FRESH_CASCADE_STARTS = 4
 
 
 @isolated
@@ -95,11 +94,8 @@ def close_loop(
     data = blocks_of(fit, record, other, settings)
     names = _names(fit, data.known, candidates)
     # As far up as its extensions will get: what a better climb gains is no effect.
-    first = quick_fit(
-        fit.model, without(data.known, data.held_out), seed, None if data.refit else fit.at_mode(),
-        poles=poles_of(fit),
-    )  # fmt: skip
     rounds = SearchContext(data, names, seed, level, tries, effects, workers, progress, settings)
+    first = rounds.refit(_given(fit, data, seed), fit.model)
     course = SearchState(rounds, watch, first)
     watch.stop("fit of block A")
     while course.go_round():
@@ -116,6 +112,20 @@ def close_loop(
     fitted = _final(fits, fit, known, workers, progress)
     watch.stop("last fits")
     return report_of(fitted[0], fitted[-1], course, warnings)
+
+
+def _given(fit: Fit, data: Blocks, seed: int) -> Fit:
+    """The mode that a fit of block A starts from: a fresh one where the fit is of other data.
+
+    So it is where trajectories were sites, whose parameters are not the mode of the search.
+    """
+    if fit.collapsed and not data.refit:
+        return fit.at_mode()
+    known = where_inputs_are_known(without(data.known, data.held_out), longest_delay(fit.model))
+    return fit_model(
+        replace(fit.model, scaling=None), known, method="map", seed=seed, workers=1,
+        restarts=FRESH_CASCADE_STARTS if fit.model.has_function else None, progress=False,
+    )  # fmt: skip
 
 
 def _names(fit: Fit, record: Record, candidates: Sequence[str] | Record | None) -> list[str]:
@@ -139,7 +149,7 @@ def _names(fit: Fit, record: Record, candidates: Sequence[str] | Record | None) 
 def _final(
     fits: Sequence[Fit], given: Fit, record: Record, workers: int | None, progress: bool
 ) -> list[Fit]:
-    """Models of block A fitted to A and B, from what they have learnt and from fresh starts.
+    """Models of block A fitted to A and B, from what they have learnt.
 
     Refits of the search are posterior modes; here the posterior is of the kind that the given fit
     has, and at least that of static functions is wanted.
@@ -147,10 +157,9 @@ def _final(
 
     def refitted(found: Fit) -> Fit:
         model = replace(found.model, scaling=None)
-        restarts = LAST_LINEAR_STARTS if model.is_linear else LAST_CASCADE_STARTS
         return fit_model(
-            model, record, start=found, restarts=restarts, seed=found.seed, workers=1,
-            progress=False, **_method_of(given, model),
+            model, record, start=found, restarts=0, seed=found.seed, workers=1, progress=False,
+            **_method_of(given, model),
         )  # fmt: skip
 
     return parallel_map(refitted, fits, workers=workers, progress=progress, description="last fits")

@@ -24,6 +24,9 @@ from pyro_dynogp.statistics.autoregression import Whitener, check_samples, fitte
 from pyro_dynogp.statistics.bootstrap import Scan, noise_of, scanned, standardised_gains
 from pyro_dynogp.statistics.settings import LoopSettings
 
+# Numbers of filtered columns that are multiplied at once.
+AT_ONCE = 1_000_000
+
 
 class Projection:
     """Series under a filter of the noise, less what a nuisance explains of them there.
@@ -201,22 +204,35 @@ def free_columns(
     """
     size = np.sqrt(np.square(columns).sum(0))
     scaled = columns / np.where(size > 0, size, 1.0)
+    # Variants of one size together, as many as fit into so many numbers.
+    parts: list[tuple[list[int], np.ndarray]] = []
+    for k in sorted({len(v) for v in variants}):
+        alike = [j for j, v in enumerate(variants) if len(v) == k]
+        step = max(1, AT_ONCE // (max(k, 1) * len(columns)))
+        for some in (alike[i : i + step] for i in range(0, len(alike), step)):
+            parts.append((some, np.array([variants[j] for j in some]).reshape(len(some), k)))
 
     def prepare(under: Projection) -> Score:
-        w = under.filtered(scaled)
-        norm = np.maximum(np.sqrt(np.einsum("ij,ij->j", w, w)), 1e-12)
-        P = (under.Q.T @ w) / norm
-        inverses = []
-        for v in variants:  # each by itself: variants are many, and share few columns
-            G = (w[:, v].T @ w[:, v]) / (norm[v][:, None] * norm[v]) - P[:, v].T @ P[:, v]
+        w = np.ascontiguousarray(under.filtered(scaled).T)  # (K, m)
+        norm = np.maximum(np.sqrt(np.einsum("ij,ij->i", w, w)), 1e-12)
+        P = (w @ under.Q) / norm[:, None]
+        inverses: dict[int, np.ndarray] = {}
+        stacked = []
+        for some, V in parts:  # not of all columns: variants are many, and share few
+            X, p, scale = w[V], P[V], norm[V]
+            G = (X @ X.swapaxes(1, 2)) / (scale[:, :, None] * scale[:, None])
             # The ridge makes columns that the nuisance spans explain nothing.
-            inverses.append(np.linalg.inv(G + 1e-8 * np.eye(len(v))))
+            S = np.linalg.inv(G - p @ p.swapaxes(1, 2) + 1e-8 * np.eye(V.shape[1]))
+            stacked.append(S)
+            inverses.update(zip(some, S, strict=True))
 
         def score(x: np.ndarray) -> Scored:
             e = under(x)
-            b = (w.T @ e) / norm
-            explained = [b[v] @ S @ b[v] for v, S in zip(variants, inverses, strict=True)]
-            gains = len(e) * log_ratio(np.array(explained), float(e @ e))
+            b = (w @ e) / norm
+            explained = np.empty(len(variants))
+            for (some, V), S in zip(parts, stacked, strict=True):
+                explained[some] = np.einsum("ji,jik,jk->j", b[V], S, b[V])
+            gains = len(e) * log_ratio(explained, float(e @ e))
 
             def fit(j: int) -> tuple[np.ndarray, np.ndarray]:
                 v = variants[j]

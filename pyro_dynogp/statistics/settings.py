@@ -60,11 +60,12 @@ class LoopSettings:
             Evidence: none.
         draws: posterior draws that say what parameter uncertainty leaves in a residual.
             Evidence: cost.
-        replicates: of a residual without the effect, for each p-value.
+        replicates: most of a residual without the effect, for each p-value.
             Evidence: size under white, coloured and resonant noise (docs/measurements.md).
         fewest_replicates: where records are long, and each replicate takes long.
             Evidence: cost.
-        exceedances: replicates beyond the statistic, below which a fitted tail gives the p-value.
+        exceedances: replicates beyond the statistic, below which a fitted tail gives the p-value;
+            no more are made once there are as many.
             Evidence: reason: a count of ten is known to a third of itself.
         filter_order: highest order of an autoregressive filter of the residual.
             Evidence: none.

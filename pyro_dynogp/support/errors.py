@@ -123,10 +123,10 @@ SHARE = between(0.0, 1.0, "a number between 0 and 1")
 # What an argument of each name has to be, wherever it is one; None is none given where that is the
 # default.
 RULES = {
-    **dict.fromkeys(("draws", "samples", "particles", "chains", "warmup", "restarts", "steps",
+    **dict.fromkeys(("draws", "samples", "particles", "chains", "warmup", "steps",
                      "horizon", "points", "workers", "max_rounds", "tries", "channels", "outputs",
                      "inducing", "pairs", "brownian", "count", "width"), COUNT),
-    **dict.fromkeys(("prior_samples", "refits", "channel", "inputs", "fed"), NUMBER),
+    **dict.fromkeys(("restarts", "prior_samples", "refits", "channel", "inputs", "fed"), NUMBER),
     **dict.fromkeys(("progress", "process_noise", "feedthrough", "learn_locations", "pathwise"),
                     SWITCH),
     "seed": Rule("a whole number from 0 to 2**63 - 1", whole(0, 2**63 - 1).plain),

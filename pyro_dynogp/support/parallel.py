@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from joblib.externals.loky import BrokenProcessPool
 from joblib.parallel import get_active_backend
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 from tqdm import tqdm
 
 from pyro_dynogp.support.errors import verify
@@ -44,10 +44,16 @@ def one_thread() -> Iterator[None]:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with threadpool_limits(1):
+        with _libraries().limit(limits=1):
             yield
     finally:
         torch.set_num_threads(threads)
+
+
+@functools.cache
+def _libraries() -> ThreadpoolController:
+    """Libraries of linear algebra that are loaded: to look for them takes milliseconds."""
+    return ThreadpoolController()
 
 
 @contextlib.contextmanager

@@ -160,7 +160,7 @@ def test_words_and_limits():
 
 
 def test_what_is_refused(fit):
-    with pytest.raises(ValueError, match="twin: expected False for a fit with trajectories as"):
+    with pytest.raises(ValueError, match="fit: expected a fit whose trajectories are integrated"):
         dgp.check(
             replace(fit, posterior=Sampled(fit.draws, "svi", log_q_sites={"g": torch.zeros(3)})),
             twin=40,

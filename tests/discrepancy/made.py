@@ -4,6 +4,8 @@ import numpy as np
 from scipy import stats
 from scipy.signal import lfilter
 
+import pyro_dynogp as dgp
+from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
 from pyro_dynogp.statistics.autoregression import fitted_filter
 from pyro_dynogp.statistics.evidence import Residuals
 from pyro_dynogp.statistics.settings import LoopSettings
@@ -63,3 +65,9 @@ def within_chance(hits, trials, probability):
     """Whether a number of hits is inside the central 99.9 % of the binomial distribution."""
     low, high = stats.binom.ppf([0.0005, 0.9995], trials, probability)
     return low <= hits <= high
+
+
+def fitted_mode(model, record):
+    """Posterior mode of a linear model, on the samples for which it knows its inputs."""
+    known = where_inputs_are_known(record, longest_delay(model))
+    return dgp.fit(model, known, method="map", restarts=3, workers=1, progress=False)

@@ -10,16 +10,25 @@ import pytest
 import pyro_dynogp as dgp
 from pyro_dynogp import effects
 from pyro_dynogp.data.channels import Delayed, Recorded, Trend
-from pyro_dynogp.discrepancy import refits
-from pyro_dynogp.discrepancy.refits import energy, quick_fit, race
 from pyro_dynogp.discrepancy.search import candidates_of
-from pyro_dynogp.models.variants import with_channel, without_process_noise
-from tests.discrepancy.made import SETTINGS, coloured
+from pyro_dynogp.inference import refit as refits
+from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.methods.base import Problem
+from pyro_dynogp.inference.refit import energy, race, refit
+from pyro_dynogp.inference.run import Run
+from pyro_dynogp.inference.starts.extended import extended_starts
+from pyro_dynogp.models.variants import (
+    with_channel,
+    with_output_function,
+    without_process_noise,
+)
+from tests.discrepancy.made import SETTINGS, coloured, fitted_mode
 from tests.discrepancy.plant_dynamics import System, response
 from tests.discrepancy.test_decision import spoken_for, two_inputs
 
 N, STEP, LATE = 300, 0.1, 5
 MODEL = dgp.LinearDynamicGP(1, pairs=1)
+RUN = Run(0, workers=1)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +47,7 @@ def record():
 
 @pytest.fixture(scope="module")
 def base(record):
-    return quick_fit(MODEL, record, 0)
+    return fitted_mode(MODEL, record)
 
 
 def later(samples: float) -> dgp.LinearDynamicGP:
@@ -47,33 +56,76 @@ def later(samples: float) -> dgp.LinearDynamicGP:
 
 def test_the_most_probable_variant_comes_first(record, base):
     delays = (1, 2, 3, 4, 5, 6, 8, 11)
-    found, problems = race([later(d) for d in delays], record, base, 0)
+    found, problems = race(base, [later(d) for d in delays], record, RUN)
     assert not problems
     assert len(found) == len(delays)
     assert [energy(one) for one in found] == sorted(energy(one) for one in found)
     assert replace(found[0].model, scaling=None) == later(LATE)
     assert energy(found[0]) < energy(base) - 100.0
     # To its end the winner's climb gains little, and no other variant would have come before it.
-    whole = {d: energy(quick_fit(later(d), record, 0, base)) for d in delays}
+    whole = {d: energy(refit(base, record, model=later(d))) for d in delays}
     assert min(whole, key=lambda d: whole[d]) == LATE
     assert energy(found[0]) - whole[LATE] < 4.0
 
 
-def test_those_behind_take_only_the_first_steps(record, base):
-    found, _ = race([later(d) for d in range(1, 9)], record, base, 0)
-    # Eight steps in all of a climb from several starts.
-    steps = sorted(len(one.history) for one in found)
-    behind = len(found) - refits.FEWEST
-    assert all(count <= refits.FIRST_STEPS for count in steps[:behind])
-    assert all(refits.FIRST_STEPS < count <= refits.MORE_STEPS for count in steps[behind:])
+def test_those_behind_take_only_the_first_steps(monkeypatch, record, base):
+    taken = []
+
+    def counted(fit, records, *, model=None, run):
+        taken.append((model is None, run.steps))
+        return refit(fit, records, model=model, run=run)
+
+    monkeypatch.setattr(refits, "refit", counted)
+    found, _ = race(base, [later(d) for d in range(1, 9)], record, RUN)
+    first, more = refits.FIRST_STEPS[0], refits.MORE_STEPS[0]
+    assert taken == [(False, first)] * 8 + [(True, more)] * refits.FEWEST
+    assert all(len(one.history) <= first for one in found[refits.FEWEST :])
+
+
+def climbs_of(monkeypatch, name):
+    """Optimizer and starts of every call of a climb of `refits`."""
+    calls, climb = [], getattr(refits, name)
+
+    def noted(model, records, starts, *args, **options):
+        calls.append((options["optimizer"], starts))
+        return climb(model, records, starts, *args, **options)
+
+    monkeypatch.setattr(refits, name, noted)
+    return calls
+
+
+def test_with_steps_the_most_probable_start_of_a_linear_model_climbs_alone(
+    monkeypatch, record, base
+):
+    calls = climbs_of(monkeypatch, "maximise")
+    model = later(LATE)
+    problem = Problem.of(model, record)
+    starts, _ = extended_starts(base, problem.model, problem.records, 0)
+    monkeypatch.setattr(refits, "extended_starts", lambda *given: (starts[::-1], starts[0]))
+    potential = Potential(problem.target, (problem.records,), starts[0])
+    # The base has learnt its gains without the delay: least squares are nearer.
+    assert potential.log_joint(starts[0]) > potential.log_joint(starts[-1]) + 10.0
+    refit(base, record, model=model, run=replace(RUN, steps=1))
+    ((optimizer, (start,)),) = calls
+    assert optimizer == "gauss-newton"
+    assert start is starts[0]
+    refit(base, record, model=model, run=RUN)
+    assert len(calls[1][1]) == len(starts)
+
+
+def test_a_function_more_is_climbed_by_adam_from_what_is_learnt(monkeypatch, record, base):
+    calls = climbs_of(monkeypatch, "climb")
+    refit(base, record, model=with_output_function(MODEL), run=replace(RUN, steps=2))
+    ((optimizer, starts),) = calls
+    assert (optimizer, len(starts)) == ("adam", 2)
 
 
 def test_what_cannot_be_fitted_is_said(record, base):
     still = with_channel(MODEL, Recorded("still"))
-    found, (problem,) = race([still, later(LATE)], record, base, 0)
+    found, (problem,) = race(base, [still, later(LATE)], record, RUN)
     assert len(found) == 1
     assert "constant" in problem
-    assert race([], record, base, 0) == ([], [])
+    assert race(base, [], record, RUN) == ([], [])
 
 
 def test_a_cascade_that_is_no_larger_goes_on_from_its_base(record):
@@ -81,21 +133,20 @@ def test_a_cascade_that_is_no_larger_goes_on_from_its_base(record):
     start = dgp.fit(model, record[:150], method="map", restarts=1, steps=30, workers=1,
                     progress=False)  # fmt: skip
     delayed = [with_channel(model, Delayed("u", d * STEP)) for d in (3, LATE)]
-    found, _ = race(delayed, record[:150], start, 0)
+    found, _ = race(start, delayed, record[:150], RUN)
     assert replace(found[0].model, scaling=None) == delayed[1]
     assert energy(found[0]) < energy(start) - 50.0
     assert without_process_noise(found[0].model) == found[0].model
 
 
-def test_other_noise_goes_on_from_a_linear_base(record, monkeypatch):
+def test_other_noise_goes_on_from_a_linear_base(record):
     outliers = record.outputs.copy()
     outliers[20::25] += 2.0
     spoilt = record.with_outputs(outliers)
-    base = quick_fit(later(LATE), spoilt, 0)
-    monkeypatch.delattr(refits, "_fresh")  # another climb from the beginning is not needed
+    base = fitted_mode(later(LATE), spoilt)
     robust = replace(later(LATE), likelihood=dgp.StudentT())
     plain = later(LATE)
-    found, _ = race([plain, robust], spoilt, base, 0)
+    found, _ = race(base, [plain, robust], spoilt, RUN)
     first, second = found
     assert replace(first.model, scaling=None) == robust
     # The same model under another name is as probable; twelve outliers are not normal.

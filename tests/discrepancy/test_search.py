@@ -100,12 +100,12 @@ def state():
     fit = dgp.fit(model, record[:240], restarts=1, workers=1, progress=False)
     from pyro_dynogp.discrepancy.blocks import blocks_of
     from pyro_dynogp.discrepancy.context import Stopwatch
-    from pyro_dynogp.discrepancy.refits import quick_fit
+    from pyro_dynogp.inference.refit import refit
 
     data = blocks_of(fit, record, None, SETTINGS)
     looked_for = (effects.OutputNonlinearity(), effects.Saturation(), effects.LevelShift())
     context = SearchContext(data, [], 0, 0.05, 8, looked_for, 1, False, SETTINGS)
-    first = quick_fit(model, without(data.known, data.held_out), 0, fit)
+    first = refit(fit, without(data.known, data.held_out), model=model)
     return SearchState(context, Stopwatch(), first)
 
 

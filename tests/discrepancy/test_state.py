@@ -12,10 +12,10 @@ import pyro_dynogp as dgp
 from pyro_dynogp import effects
 from pyro_dynogp.discrepancy.blocks import blocks_of
 from pyro_dynogp.discrepancy.context import SearchContext, Tested
-from pyro_dynogp.discrepancy.refits import quick_fit
 from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.discrepancy.state import SearchState
 from pyro_dynogp.discrepancy.trials import without
+from pyro_dynogp.inference.refit import refit
 from pyro_dynogp.models.variants import has_process_noise, without_process_noise
 from pyro_dynogp.statistics.evidence import Evidence
 from tests.discrepancy.made import SETTINGS
@@ -44,7 +44,7 @@ def test_process_noise_that_costs_forecasts_is_pointed_out(late, noise, hides):
     data = blocks_of(fit, record, None, SETTINGS)
     training = without(data.known, data.held_out)
     rounds = SearchContext(data, [], 0, 0.05, 8, (effects.LevelShift(),), 1, False, SETTINGS)
-    given = quick_fit(MODEL, training, 0, fit)
+    given = refit(fit, training, model=MODEL)
     said = rounds.hiding(given, rounds.plain(given))
     assert bool(said) == hides, said
     assert not hides or "better without its process noise (elpd +" in said

@@ -10,20 +10,24 @@ import torch
 import pyro_dynogp as dgp
 from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.data.channels import Recorded
-from pyro_dynogp.discrepancy.refits import quick_fit
 from pyro_dynogp.discrepancy.trials import held_out_density
-from pyro_dynogp.inference.methods import mode as cascade_fit
+from pyro_dynogp.inference import refit as refits
 from pyro_dynogp.inference.methods.base import Problem
-from pyro_dynogp.inference.methods.mode import grow
 from pyro_dynogp.inference.optimise.maximum import maximise
+from pyro_dynogp.inference.refit import refit
 from pyro_dynogp.inference.run import Run
-from pyro_dynogp.inference.starts.plans import starting_points
+from pyro_dynogp.inference.starts.extended import extended_starts
 from pyro_dynogp.inference.starts.poles import grown
-from pyro_dynogp.models.variants import with_channel, with_pairs, without_process_noise
-from tests.discrepancy.made import SETTINGS, coloured
+from pyro_dynogp.models.variants import (
+    with_channel,
+    with_input_function,
+    with_output_function,
+    with_pairs,
+    without_process_noise,
+)
+from tests.discrepancy.made import SETTINGS, coloured, fitted_mode
 from tests.discrepancy.plant_dynamics import System, response
 
-ALONE = Run(workers=1)
 NOISE, N, TRAINING = 0.05, 320, 220
 
 
@@ -46,7 +50,7 @@ def base(record):
     model = dgp.Wiener(1, pairs=1, inducing=6)
     training = record[:TRAINING]
     fit = dgp.fit(model, training, method="map", restarts=1, steps=60, workers=1, progress=False)
-    return quick_fit(model, training, 0, fit)
+    return refit(fit, training, model=model)
 
 
 def log_likelihood(model, records, values):
@@ -61,20 +65,45 @@ def test_what_has_grown_starts_at_the_likelihood_of_its_base(record, base, more)
     extended = with_channel(plain, Recorded("w")) if more == "channel" else with_pairs(plain, 1)
     problem = Problem.of(extended, record[:TRAINING])
     target, records = problem.target, problem.records
-    (start,) = starting_points(target, records, ALONE, count=1, steps=5)
-    sites = target.all_sites(target.scaling, 1)
+    (learnt,), start = extended_starts(base, target, records, 0)
     before = log_likelihood(base.model.collapsed, base.model.prepare(record[:TRAINING]), base.mode)
-    after = log_likelihood(target, records, grown(base.mode, start, sites))
+    after = log_likelihood(target, records, learnt)
     loud = log_likelihood(target, records, grown(base.mode, start))
     # A new pair has a little process noise already.
     assert after == pytest.approx(before, rel=1e-9 if more == "channel" else 1e-2)
     assert abs(loud - before) > 4.0 * max(abs(after - before), 1.0)
 
 
+@pytest.mark.parametrize("first", [True, False])
+@pytest.mark.parametrize("kind", ["linear", "Wiener", "Hammerstein"])
+def test_a_function_more_starts_as_a_line(record, base, kind, first):
+    """The model with it explains what its base does, of whatever layers that is."""
+    training = record[:TRAINING]
+    if kind == "linear":
+        given = fitted_mode(dgp.LinearDynamicGP(1, pairs=1), training)
+    else:
+        given = base
+        if kind == "Hammerstein":
+            model = dgp.Hammerstein(1, pairs=1, inducing=6)
+            given = dgp.fit(model, training, method="map", restarts=1, steps=60, workers=1,
+                            progress=False)  # fmt: skip
+    plain = replace(given.model, scaling=None)
+    extended = with_input_function(plain) if first else with_output_function(plain)
+    if extended is None:  # there is one already
+        assert kind == ("Hammerstein" if first else "Wiener")
+        return
+    problem = Problem.of(extended, training)
+    target = problem.target
+    (learnt, *curved), _ = extended_starts(given, target, problem.records, 0)
+    before = log_likelihood(given.model.collapsed, given.model.prepare(training), given.mode)
+    assert log_likelihood(target, problem.records, learnt) == pytest.approx(before, abs=5.0)
+    assert len(curved) == (not first)
+
+
 def test_an_extended_cascade_explains_what_its_base_lacks(record, base):
     training, fold = record[:TRAINING], np.arange(N) >= TRAINING
     model = with_channel(replace(base.model, scaling=None), Recorded("w"))
-    fit = quick_fit(model, training, 0, base)
+    fit = refit(base, training, model=model)
     assert float(fit.start_energies[0]) < float(base.start_energies[0]) - 50.0
     gain = held_out_density(fit, record, fold, "forecast")
     gain = gain - held_out_density(base, record, fold, "forecast")
@@ -86,36 +115,34 @@ def test_an_extended_cascade_explains_what_its_base_lacks(record, base):
 
 
 def test_the_same_model_goes_on_from_where_it_is(record, base):
-    again = quick_fit(base.model, record[:TRAINING], 0, base)
+    again = refit(base, record[:TRAINING], model=base.model)
     assert float(again.start_energies[0]) <= float(base.start_energies[0]) + 1e-6
 
 
-def test_growing_climbs_without_process_noise_too(monkeypatch, record, base):
+def test_a_climb_without_process_noise_comes_first(monkeypatch, record, base):
     calls = []
 
     def recorded(model, records, starts, run, **options):
         found = maximise(model, records, starts, run, **options)
-        calls.append((model, starts[0], found[0]))
+        calls.append((model, starts, found))
         return found
 
-    monkeypatch.setattr(cascade_fit, "maximise", recorded)
-    records = base.model.prepare(record[:TRAINING])
-    target = base.model.collapsed
-    (start,) = starting_points(target, records, ALONE, count=1, steps=5)
-    calls.clear()
-    found = grow(target, records, base.mode, start, ALONE, steps=5)
-    (quiet, loud, without), (_, first, one), (_, second, other) = calls
+    monkeypatch.setattr(refits, "maximise", recorded)
+    training, run = record[:TRAINING], Run(0, workers=1, steps=5)
+    found = refit(base, training, model=base.model, run=run)
+    (_, new) = extended_starts(base, base.model, base.model.prepare(training), 0)
+    (quiet, (loud,), without), (_, (first, second), optima) = calls
     assert not quiet.layers[0].process_noise
     assert float(loud["noise_sd"]) >= 0.5
     torch.testing.assert_close(first["f_values"], base.mode["f_values"])
-    torch.testing.assert_close(second["f_values"], without.values["f_values"])
-    torch.testing.assert_close(second["g_noise_gain_unit"], start["g_noise_gain_unit"])
-    assert [x.energy for x in found] == sorted([one.energy, other.energy])
+    torch.testing.assert_close(second["f_values"], without[0].values["f_values"])
+    torch.testing.assert_close(second["g_noise_gain_unit"], new["g_noise_gain_unit"])
+    assert found.start_energies.tolist() == [one.energy for one in optima]
     # Where there is no such noise one climb is enough.
     calls.clear()
-    silent = without_process_noise(base.model).collapsed
-    grow(silent, records, base.mode, start, ALONE, steps=2)
-    assert len(calls) == 1
+    refit(base, training, model=without_process_noise(base.model), run=run)
+    ((_, starts, _),) = calls
+    assert len(starts) == 1
 
 
 def test_models_without_process_noise_stay_as_they_are():

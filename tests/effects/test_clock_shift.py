@@ -9,11 +9,10 @@ import pytest
 import pyro_dynogp as dgp
 from pyro_dynogp import effects
 from pyro_dynogp.data.channels import ShiftedClock
-from pyro_dynogp.discrepancy.refits import quick_fit
 from pyro_dynogp.discrepancy.trials import Trial, run
 from pyro_dynogp.effects.clock_shift import clock_shift, seasons
 from pyro_dynogp.models.variants import with_channel
-from tests.discrepancy.made import SETTINGS, coloured
+from tests.discrepancy.made import SETTINGS, coloured, fitted_mode
 from tests.discrepancy.plant_dynamics import System, response
 from tests.discrepancy.series import residuals, share
 from tests.discrepancy.test_decision import spoken_for
@@ -106,7 +105,7 @@ def test_seasons_begin_when_clocks_change(record, zone, season):
 
 @pytest.mark.parametrize(("instant", "shift"), [(FIRST + 24, LATE - 1), (FIRST - 9, LATE + 2)])
 def test_instant_and_shift_are_refined(record, instant, shift):
-    base = quick_fit(MODEL, record[:400], 0)
+    base = fitted_mode(MODEL, record[:400])
     effect = effects.ClockShift()
     where = {"channel": "u", "shift": shift * STEP, "time": instant * STEP, "time_unit": "s"}
     where |= {"stamp": record.timestamps[instant].isoformat(), "zone": "Europe/Berlin"}
@@ -136,7 +135,7 @@ def test_what_a_rule_says_is_not_refined(record):
 def test_forecasts_read_a_late_clock_ahead(record):
     """The state at the end of the past needs inputs whose stamps are in the future."""
     late = with_channel(MODEL, ShiftedClock("u", LATE * STEP, (FIRST * STEP,)))
-    fit = quick_fit(late, record[:400], 0)
+    fit = fitted_mode(late, record[:400])
     whole = fit.model.check(record)[0]
     for cut in (300, 350, 400):
         found = fit.forecast(record[:cut], record[cut:])

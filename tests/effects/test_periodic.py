@@ -8,10 +8,9 @@ import pytest
 import pyro_dynogp as dgp
 from pyro_dynogp import effects
 from pyro_dynogp.data.channels import Sinusoid
-from pyro_dynogp.discrepancy.refits import quick_fit
 from pyro_dynogp.discrepancy.trials import Trial, run
 from pyro_dynogp.effects.periodic import periodic_disturbance
-from tests.discrepancy.made import SETTINGS, coloured
+from tests.discrepancy.made import SETTINGS, coloured, fitted_mode
 from tests.discrepancy.plant_dynamics import System, response
 from tests.discrepancy.series import residuals
 from tests.discrepancy.test_decision import spoken_for
@@ -95,7 +94,7 @@ def test_the_period_is_that_of_the_fundamental(shown: int, off: float) -> None:
     effect = effects.PeriodicDisturbance()
     found = spoken_for(effect, 0.001, 0.01, period=seen, output="y", time_unit="s")
     variants = tuple(effect.extend(MODEL, found.evidence, training))
-    base = quick_fit(MODEL, training, 0)
+    base = fitted_mode(MODEL, training)
     tried = run(
         Trial(
             variants, record, (np.arange(N) >= 300,), base, 0, SETTINGS, "forecast", effect.refine

@@ -240,6 +240,17 @@ class TestWarmStart:
         assert warm.start_energies[0] <= map_fit.start_energies[0] + 1e-6
         assert warm.start_energies[0] < cold.start_energies[0] - 1.0
 
+    def test_without_restarts_it_goes_on_from_the_start_alone(self, record, map_fit):
+        model = dgp.LinearDynamicGP(inputs=1, pairs=1)
+        options = {"restarts": 0, "workers": 1, "progress": False}
+        again = dgp.fit(model, map_fit.records, start=map_fit, **options)
+        (energy,) = again.start_energies
+        assert energy == pytest.approx(map_fit.start_energies[0], abs=0.05)
+        # The climb has nothing to do there; two iterations say so.
+        assert len(again.history) <= 4
+        with pytest.raises(ValueError, match="restarts: expected a whole number >= 1"):
+            dgp.fit(model, record, **options)
+
     def test_a_larger_model_keeps_what_a_smaller_one_has_learnt(self, record, map_fit):
         wider = dgp.fit(
             dgp.LinearDynamicGP(inputs=1, pairs=2), record[:160], start=map_fit,

@@ -95,15 +95,6 @@ def test_equals_the_trace(name):
             torch.testing.assert_close(slope, gradient, rtol=1e-10, atol=1e-10 * size)
 
 
-def test_inputs_of_each_point():
-    target, args, points = prepared("linear")
-    stacked = {name: torch.stack([one[name] for one in points]) for name in points[0]}
-    u = ONE.tensors().inputs * torch.tensor([1.0, 0.5, -2.0]).double()[:, None, None]
-    found = [one(stacked, 3, [u]) for one in (density_of(target, args), Traced(target, args))]
-    torch.testing.assert_close(found[0], found[1], rtol=1e-10, atol=1e-10)
-    assert float((found[0] - density_of(target, args)(stacked, 3))[1:].abs().min()) > 1e-3
-
-
 def test_other_functions_are_traced():
     model = Linear(1, pairs=1).scaled_to(ONE)
     with_trajectories = dgp.Wiener(1, pairs=1, inducing=4).scaled_to(ONE)

@@ -55,3 +55,14 @@ def test_what_is_refused(map_fit, layered_fit, record):
         refit(layered_fit, layered_fit.records)
     with pytest.raises(ValueError, match="records: expected 1, as before"):
         refit(replace(map_fit), (record, record))
+
+
+def test_the_mode_of_a_fit(map_fit, svi_fit, layered_fit):
+    assert map_fit.at_mode() is map_fit
+    mode = svi_fit.at_mode()
+    assert (mode.method, mode.records) == ("map", svi_fit.records)
+    for name, value in svi_fit.mode.items():
+        torch.testing.assert_close(mode.draws[name], value.unsqueeze(0))
+    # The middle of a posterior with trajectories as sites is another number than a mode.
+    with pytest.raises(ValueError, match="fit: expected a fit whose trajectories are integrated"):
+        layered_fit.at_mode()

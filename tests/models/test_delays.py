@@ -7,7 +7,6 @@ import pytest
 
 import pyro_dynogp as dgp
 from pyro_dynogp.data.channels import Delayed, Recorded
-from pyro_dynogp.discrepancy.refits import poles_of, quick_fit
 from pyro_dynogp.discrepancy.residuals import residuals_of
 from pyro_dynogp.models.delays import (
     comparable,
@@ -16,7 +15,7 @@ from pyro_dynogp.models.delays import (
     where_inputs_are_known,
 )
 from pyro_dynogp.models.variants import with_channel
-from tests.discrepancy.made import coloured
+from tests.discrepancy.made import coloured, fitted_mode
 from tests.discrepancy.plant_dynamics import System, response
 
 N, STEP, LATE, NOISE = 300, 0.1, 8, 0.02
@@ -58,21 +57,21 @@ def test_outputs_are_missing_until_the_first_input_arrives(record: dgp.Record) -
 
 def test_a_late_input_does_not_spoil_the_poles(record: dgp.Record) -> None:
     """With the first value of the input held before the record, poles and noise are wrong."""
-    found = quick_fit(later(LATE), record, 0)
+    found = fitted_mode(later(LATE), record)
     # Of 292 samples the noise's sd is known to 1 / sqrt(2 * 292) = 4 %, a pole at noise of 2 % to
     # less; without the mending the noise is off by two thirds.
-    assert poles_of(found)[0] * STEP == pytest.approx(POLE, rel=0.02)
+    assert found.modes.poles[0] * STEP == pytest.approx(POLE, rel=0.02)
     noise = found.noise_sd[0] * found.scaling.output_scale[0]
     assert noise == pytest.approx(NOISE, rel=0.15)
     late = np.concatenate([np.full(LATE, record.inputs[0, 0]), record.inputs[:-LATE, 0]])
     held = dgp.Record(record.time, late, record.outputs[:, 0])
-    spoilt = quick_fit(MODEL, held, 0)
+    spoilt = fitted_mode(MODEL, held)
     assert spoilt.noise_sd[0] * spoilt.scaling.output_scale[0] > 1.4 * NOISE
 
 
 def test_residuals_are_missing_where_inputs_are_not_known(record: dgp.Record) -> None:
-    prompt = residuals_of(quick_fit(MODEL, record, 0), record, settings=dgp.LoopSettings())
-    late = residuals_of(quick_fit(later(LATE), record, 0), record, settings=dgp.LoopSettings())
+    prompt = residuals_of(fitted_mode(MODEL, record), record, settings=dgp.LoopSettings())
+    late = residuals_of(fitted_mode(later(LATE), record), record, settings=dgp.LoopSettings())
     missing = [int(np.isnan(one.output).sum()) for one in (prompt, late)]
     assert LATE <= missing[1] <= LATE + 0.1 * N
     assert np.isfinite(late.output[missing[1] :]).all()

@@ -127,6 +127,32 @@ def test_the_best_variant_is_that_of_the_largest_standardised_gain():
     assert scan.p_value == pytest.approx(expected)
 
 
+def test_a_null_ends_once_as_many_replicates_as_count_are_as_large():
+    made = []
+
+    def null(larger):
+        for _ in range(4):
+            z = np.zeros((50, 1))
+            z[:larger] = 9.0
+            made.append(len(z))
+            yield z
+
+    def scan(larger):
+        made.clear()
+        fit = np.zeros(5), Whitener(np.zeros(0))
+        gains, degrees = np.array([4.0]), np.ones(1)
+        rows = np.ones(5, dtype=bool)
+        return scanned(gains, degrees, null(larger), lambda _: fit, rows, SETTINGS).p_value
+
+    enough = SETTINGS.exceedances
+    assert scan(enough) == pytest.approx((1 + enough) / 51)
+    assert made == [50]
+    assert scan(enough - 4) == pytest.approx((1 + 2 * (enough - 4)) / 101)
+    assert made == [50, 50]
+    scan(0)
+    assert made == [50] * 4
+
+
 def test_filters_of_series_have_the_coefficients_that_made_them():
     noise = Noise(np.array([1.2, -0.6]), white(), np.zeros(4000, dtype=bool), np.zeros((0, 4000)))
     (x,) = replicates(noise, 1)

@@ -20,11 +20,14 @@ from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.plans import (
     RANDOM,
+    Plan,
     Values,
     linear_starts,
     linear_twins,
     optimizer_for,
+    optimizer_near,
     spread,
+    starting_point,
 )
 from pyro_dynogp.inference.starts.poles import grown
 from pyro_dynogp.layers.noise import TYPICAL
@@ -33,6 +36,7 @@ from pyro_dynogp.models.prepared import Records, as_measured
 from pyro_dynogp.models.variants import without_noise_below_functions
 from pyro_dynogp.support.errors import invalid, warn
 from pyro_dynogp.support.frozen import FrozenMapping
+from pyro_dynogp.support.parallel import seeded
 
 # Most iterations of linear fits by each optimizer.
 STEPS: Mapping[str, int] = MappingProxyType(
@@ -50,7 +54,7 @@ NO_BETTER = (
 UNEXPLAINED = 0.5
 
 
-def _louder(values: Values) -> Values:
+def louder(values: Values) -> Values:
     """A start whose measurement noise can stand for what dynamics and functions lack as yet.
 
     Linear fits leave that to process noise. Without any, noise of their size makes the density so
@@ -119,16 +123,24 @@ def best_optima(
         ValueError: where no start leads to a point with a density.
     """
     model, records, learnt = problem.model, problem.records, problem.learnt
-    optimizer = optimizer or optimizer_for(model)
-    if model.is_linear:
+    if learnt is not None and run.restarts == 0:
+        optimizer = optimizer or optimizer_near(model)
+        with seeded(run.seed):  # what has no typical value is drawn
+            start = starting_point(model, records, Plan(None, None, False, run.seed))
+        optima = maximise(
+            problem.target, records, [grown(learnt, start)], run, optimizer=optimizer,
+            steps=steps or STEPS[optimizer], effort=Effort(near=True),
+        )  # fmt: skip
+    elif model.is_linear:
+        optimizer = optimizer or optimizer_for(model)
         starts = linear_starts(model, records, run.restarts, run.seed)
         if learnt is not None:
             starts = [grown(learnt, starts[0]), *starts]
         steps = steps or STEPS[optimizer]
         optima = maximise(problem.target, records, starts, run, steps=steps, optimizer=optimizer)
     else:
-        steps = steps or 600
-        optima = cascade_optima(problem, run, optimizer, steps)
+        optimizer = optimizer or optimizer_for(model)
+        optima = cascade_optima(problem, run, optimizer, steps or 600)
     if optima[0].energy >= WALL:
         raise ValueError(
             "fit: no start reached a point where the likelihood can be evaluated. Check the "
@@ -221,35 +233,14 @@ def climb(
     if quiet != model and starts:
         steps = max(1, steps // 2)
         key = f"{prefix}without-process-noise"
-        found = optima_of(quiet, [_louder(start) for start in starts], key)
+        found = optima_of(quiet, [louder(start) for start in starts], key)
         better = found[: (len(starts) + 1) // 2]
         starts = [grown(one.values, starts[0]) for one in better]
     elif model.has_feedback:
-        starts = [_louder(start) for start in starts]
+        starts = [louder(start) for start in starts]
     optima = optima_of(model, [*learnt, *starts], f"{prefix}cascade")
     if not better or not (model.has_feedback or math.isfinite(line)):
         return optima
     prepared = model.prepare(records)
     silent = [silenced(model, prepared, one, starts[0]) for one in better]
     return optima if noise_pays(model, prepared, optima[0], silent[0], line) else silent
-
-
-def grow(
-    model: Model, records: Records, learnt: Values, start: Values, run: Run, *, steps: int
-) -> list[Optimum]:
-    """Optima of the collapsed model near what a smaller model, or the same one, has learnt.
-
-    Process noise that has explained what the smaller model lacks keeps the larger one from
-    explaining it: one climb goes without any first, and takes that of `start` then.
-    """
-
-    def climbed(target: Model, point: Values, key: str) -> Optimum:
-        return maximise(
-            target, records, [point], run, optimizer="preconditioned", steps=steps, key=key
-        )[0]
-
-    starts = [learnt]
-    quiet = without_noise_below_functions(model)
-    if quiet != model:
-        starts.append(grown(climbed(quiet, _louder(learnt), "grown-quiet").values, start))
-    return sorted((climbed(model, point, "grown") for point in starts), key=lambda o: o.energy)

@@ -22,8 +22,6 @@ from scipy.interpolate import PchipInterpolator
 
 from pyro_dynogp.inference.density import WALL, Potential
 from pyro_dynogp.inference.optimise.descent import bounded_root, piece
-from pyro_dynogp.inference.optimise.lockstep import Functions
-from pyro_dynogp.inference.optimise.side_by_side import each_in_lockstep
 
 # Nats below the top at which the density counts as zero; how often a range is doubled or halved to
 # find that depth; points of the grid for each of two numbers.
@@ -41,7 +39,7 @@ ITERATIONS = 30
 # Gradient, in coordinates that are round at the fitted number, at which they are there.
 FLAT = 0.05
 # Negative log densities, up to a constant, of several values of the number or numbers; infinite
-# where they cannot be evaluated. Several at once cost little more than one.
+# where they cannot be evaluated.
 Energies = Callable[[Sequence[tuple[float, ...]]], np.ndarray]
 
 
@@ -239,14 +237,11 @@ def _lowest(
     tasks: Sequence[tuple[Potential, np.ndarray]], root: np.ndarray
 ) -> list[tuple[float, np.ndarray]]:
     """Lowest energies from points on, to a few hundredths of a nat, and where they are."""
-
-    def run(start: np.ndarray) -> Callable[[Functions], tuple[np.ndarray, float, str]]:
-        return lambda own: piece(own, start, root, ITERATIONS, [], flat=FLAT)
-
-    found = each_in_lockstep(
-        [one for one, _ in tasks], [run(start) for _, start in tasks], jacobian=True
-    )
-    return [(energy if energy < WALL else np.inf, z) for z, energy, _ in found]
+    ends = [
+        piece(potential.with_jacobian, start, root, ITERATIONS, [], flat=FLAT)
+        for potential, start in tasks
+    ]
+    return [(energy if energy < WALL else np.inf, z) for z, energy, _ in ends]
 
 
 def _range(

@@ -153,27 +153,28 @@ def _optimise(task: _Task) -> list[Optimum]:
 def _climb(task: _Task) -> list[Optimum]:
     with seeded(task.run.seed):
         potential = Potential(task.model, (task.records,), task.starts[0])
-        found = _climbs(potential, task)
-        ends = np.stack([z for z, _, _ in found])
-        energies = potential.values_and_gradients(ends)[0]
+        found, energies = _climbs(potential, task)
         return [
             Optimum(float(energy), _values(potential, z), np.asarray(history), message)
             for energy, (z, history, message) in zip(energies, found, strict=True)
         ]
 
 
-def _climbs(potential: Potential, task: _Task) -> list[Climb]:
+def _climbs(potential: Potential, task: _Task) -> tuple[list[Climb], np.ndarray]:
+    """Climbs from every start, and the energies (k,) at their ends."""
     starts = [potential.pack(start).numpy() for start in task.starts]
     if task.optimizer == "gauss-newton":
         innovations = gauss_newton.Innovations(potential)
-        return [gauss_newton.climb(innovations, z, task.steps) for z in starts]
+        found = [gauss_newton.climb(innovations, z, task.steps) for z in starts]
+        return found, innovations.energies(np.stack([z for z, _, _ in found]))
     method = _METHODS[task.optimizer]
     every = potential.hessian_cost  # of a climb, Hessians are at most half the work
 
     def run(z: np.ndarray) -> Callable[[Functions], Climb]:
         return lambda functions: method(functions, z, task, every)
 
-    return in_lockstep(potential.values_and_gradients, [run(z) for z in starts])
+    found = in_lockstep(potential.values_and_gradients, [run(z) for z in starts])
+    return found, potential.values_and_gradients(np.stack([z for z, _, _ in found]))[0]
 
 
 def _values(potential: Potential, z: np.ndarray) -> dict[str, Tensor]:

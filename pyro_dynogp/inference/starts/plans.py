@@ -61,6 +61,14 @@ def leading_layers(model: Model) -> tuple[Wire, ...]:
     )
 
 
+def one_output(records: Sequence[PreparedRecord]) -> tuple[PreparedRecord, ...]:
+    """Records with their first output alone."""
+    names = [records[0].record.output_names[0]]
+    selected = [each.record.select(outputs=names) for each in records]
+    scaling = Scaling.from_records(selected)
+    return tuple(PreparedRecord.of(record, scaling) for record in selected)
+
+
 @dataclass(frozen=True)
 class Plan:
     """One restart: which layer takes over which linear optimum.
@@ -280,7 +288,7 @@ def linear_twins(
         assert isinstance(one.layer, Dynamic)
         linear = linear_twin(model, one.layer, scaling)
         if linear not in known:
-            training = tuple(records) if linear.outputs == model.outputs else _one_output(records)
+            training = tuple(records) if linear.outputs == model.outputs else one_output(records)
             twin = replace(linear, scaling=training[0].scaling)
             found = maximise(
                 twin,
@@ -294,13 +302,6 @@ def linear_twins(
             known[linear] = twin, training, [optimum.values for optimum in found]
         twins[one.name] = known[linear]
     return twins
-
-
-def _one_output(records: Sequence[PreparedRecord]) -> tuple[PreparedRecord, ...]:
-    names = [records[0].record.output_names[0]]
-    selected = [each.record.select(outputs=names) for each in records]
-    scaling = Scaling.from_records(selected)
-    return tuple(PreparedRecord.of(record, scaling) for record in selected)
 
 
 def linear_starts(
@@ -323,3 +324,8 @@ def optimizer_for(model: Model) -> Optimizer:
     if has_innovations(model):
         return "gauss-newton"
     return "adam" if model.has_function and not model.has_feedback else "lbfgs"
+
+
+def optimizer_near(model: Model) -> Optimizer:
+    """The optimizer that goes on from near an optimum."""
+    return "gauss-newton" if has_innovations(model) else "preconditioned"

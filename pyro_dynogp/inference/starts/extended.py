@@ -1,0 +1,106 @@
+"""Starting points of a model that extends a fitted one: what is learnt, and what is new."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.starts.dynamic import Values
+from pyro_dynogp.inference.starts.plans import (
+    Plan,
+    leading_layers,
+    linear_twin,
+    one_output,
+    starting_point,
+)
+from pyro_dynogp.inference.starts.poles import grown, random_poles, values_given_poles
+from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.prepared import PreparedRecord
+from pyro_dynogp.models.wiring import Dynamic, Static
+from pyro_dynogp.support.parallel import seeded
+
+# Random sets of poles that are new, and how many of them linear models start from.
+TRIES, KEPT = 24, 3
+
+
+def extended_starts(
+    base: Fitted, model: Model, records: Sequence[PreparedRecord], seed: int
+) -> tuple[list[Values], Values]:
+    """Starts at what a fit has learnt, and the values of what is new before that is taken over.
+
+    A linear model keeps its poles; its gains come from least squares in one start, from the fit in
+    another. Other models keep all values of the layers that they have in common with the fit, and
+    what is new does nothing yet: new inputs have no gain, a new function is a straight line. A
+    function on top of what was the last layer is also tried as the mean output given its input,
+    as a line lets the dynamics first imitate what the function should do.
+
+    Args:
+        base: of a model that `model` extends. model, records: what is fitted.
+        seed: of new poles.
+    """
+    scaling = records[0].scaling
+    places = _places(base.model, model)
+    learnt = {_renamed(site, places): value for site, value in base.mode.items()}
+    sites = model.all_sites(scaling, len(records))
+    dynamic = base.system_at(base.mode).dynamic
+    old = {places.get(wire.name): layer.modes.poles.numpy() for wire, layer in dynamic}
+    none = np.zeros(0, dtype=complex)
+    if model.is_linear:
+        ((wire, _),) = model.dynamic
+        given = _given_poles(model, records, old.get(wire.name, none), seed)
+        return [*given, grown(learnt, given[0])], given[0]
+    leading = next(iter(leading_layers(model)), None)
+    name, fresh, linear = None, None, None
+    if leading is not None:
+        assert isinstance(leading.layer, Dynamic)
+        name = leading.name
+        twin = linear_twin(model, leading.layer, scaling)
+        training = records if twin.outputs == model.outputs else one_output(records)
+        twin = replace(twin, scaling=training[0].scaling)
+        (fresh, *_) = _given_poles(twin, training, old.get(name, none), seed)
+        own = {_renamed(site, {name: "g"}): value for site, value in learnt.items()}
+        linear = grown(own, fresh, twin.all_sites(training[0].scaling, len(training)))
+    topped = isinstance(model.layers[-1], Static) and isinstance(base.model.layers[-1], Dynamic)
+    plans = [Plan(name, fresh, False, seed), Plan(name, linear, False, seed)]
+    if topped:
+        plans.append(Plan(name, linear, True, seed))
+    with seeded(seed):  # what has no typical value is drawn
+        new, *starts = [starting_point(model, records, plan) for plan in plans]
+    if topped and leading is not None:  # scaled to unit size, for the function above
+        learnt = {k: v for k, v in learnt.items() if not k.startswith(f"{leading.name}_")}
+    return [grown(learnt, start, sites) for start in starts], new
+
+
+def _given_poles(
+    model: Model, records: Sequence[PreparedRecord], poles: np.ndarray, seed: int
+) -> list[Values]:
+    """Values of a linear model by least squares given its poles, and new ones, the best first."""
+    scaling = records[0].scaling
+    ((_, layer),) = model.dynamic
+    generator = np.random.default_rng(seed)
+    kept, more = poles[: layer.pairs], max(0, layer.pairs - len(poles))
+    found = []
+    for _ in range(TRIES if more else 1):
+        both = np.concatenate([kept, random_poles(more, scaling, generator)])
+        found.append(values_given_poles(model, records, scaling, both))
+    return [values for _, values in sorted(found, key=lambda one: one[0])[:KEPT]]
+
+
+def _places(base: Model, model: Model) -> dict[str, str]:
+    """Names of layers in an extended model by their names in the model that it extends.
+
+    A layer more is the first one where that is a function and was none before, else the last.
+    """
+    first = isinstance(model.layers[0], Static) and not isinstance(base.layers[0], Static)
+    skipped = len(model.layers) - len(base.layers) if first else 0
+    pairs = zip(base.wires, model.wires[skipped:], strict=False)
+    return {old.name: new.name for old, new in pairs}
+
+
+def _renamed(site: str, places: Mapping[str, str]) -> str:
+    """Name of a layer's site where the layer has another name; that of any other site."""
+    layer = max((name for name in places if site.startswith(f"{name}_")), key=len, default=None)
+    return site if layer is None else places[layer] + site[len(layer) :]
