@@ -12,7 +12,7 @@ ARGUMENTS = 12
 LINES = 31_500
 # The package of two versions before had 34 928; kernels in lanes, the density without tracing,
 # Gauss-Newton (1900 lines) and nonlinear feedback (650 lines) came since. To shrink, and to go.
-LINES_TODAY = 39_100
+LINES_TODAY = 39_200
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

@@ -1,4 +1,4 @@
-"""Command line: pyro-dynogp demo, info, fit, simulate, close-loop.
+"""Command line: pyro-dynogp demo, info, fit, simulate, close-loop, compile.
 
 Torch and Pyro are imported inside the commands, so that ``--help`` need not wait for them.
 """
@@ -11,6 +11,7 @@ from typing import Any, Unpack
 import click
 
 from pyro_dynogp.cli.close_loop import close_loop
+from pyro_dynogp.cli.compilation import compile_now
 from pyro_dynogp.cli.data import Clock, Columns, InvalidInput, record_for, training_and_test
 from pyro_dynogp.cli.options import CHANNELS, CLOCK, PAIRS, WORK, seed
 
@@ -255,3 +256,4 @@ def simulate(
 
 
 main.add_command(close_loop)
+main.add_command(compile_now)

@@ -19,6 +19,7 @@ from tests.benchmarks import (
     criticism,
     electricity,
     example2,
+    first_use,
     fits,
     guides,
     loop_cost,
@@ -35,6 +36,7 @@ from tests.benchmarks.paper import run as paper
 
 PARTS = {
     "speed": speed.run,
+    "first_use": first_use.run,
     "fits": fits.run,
     "example2": example2.run,
     "wiener": wiener.run,
