@@ -75,6 +75,15 @@ class MomentOutputs(OutputProcess):
             density - self.scale.log(),
         )
 
+    def innovations(self, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """See `OutputProcess`."""
+        error, variance, density = self._pass(y, smoothing.innovate)
+        found = self.scale * error, self.scale.square() * variance, density - self.scale.log()
+        if self.several:
+            return found
+        error, variance, density = (x.squeeze(-1) for x in found)
+        return error, variance, density
+
     def one_step(self, y: Tensor) -> Moments:
         """See `OutputProcess`."""
         error, variance, density = self._pass(y, smoothing.innovate)

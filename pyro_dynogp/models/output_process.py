@@ -135,6 +135,14 @@ class OutputProcess(TorchDistribution):
         """Log-density (*s, *batch) of outputs (*s, *batch, *event) [nats]."""
 
     @abstractmethod
+    def innovations(self, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Errors of one-step predictions, their variances and log-densities, each (*batch, *event).
+
+        In units of the record, with noise. Of outputs of one time those that follow are given those
+        before. Of a missing sample they are without meaning.
+        """
+
+    @abstractmethod
     def one_step(self, y: Tensor) -> Moments:
         """Of each measured output (*batch, n, n_y) given those before it; with its noise.
 

@@ -46,6 +46,13 @@ STEPS: Mapping[str, int] = MappingProxyType(
 # Most starts of linear fits of each kind; iterations of those that come before cascades.
 RANDOM = 6
 LINEAR_STEPS = 40
+# Most iterations of models with functions.
+FUNCTION_STEPS: Mapping[str, int] = MappingProxyType(
+    {"gauss-newton": 40, "lbfgs": 600, "preconditioned": 600, "adam": 600}
+)
+# Process noise at which climbs from optima without any begin, as a share of that of a linear fit,
+# which has it explain what the functions should.
+FAINT = 0.03
 # Restarts of models with feedback. Sets of them, until one beats the linear model in free runs;
 # what is said where none does.
 LOOPED = 4
@@ -106,6 +113,14 @@ def _louder(values: Values) -> Values:
     }
 
 
+def _faint(values: Values) -> Values:
+    """A start whose process noise is `FAINT`."""
+    return {
+        name: FAINT * value if name.endswith("_noise_gain_local_scale") else value
+        for name, value in values.items()
+    }
+
+
 def _one_output(records: Sequence[PreparedRecord]) -> tuple[PreparedRecord, ...]:
     names = [records[0].record.output_names[0]]
     selected = [each.record.select(outputs=names) for each in records]
@@ -162,7 +177,7 @@ def check_optimizer(optimizer: Optimizer | None, model: Model | None = None) -> 
 
 
 def optimizer_for(model: Model) -> Optimizer:
-    """Gauss-Newton for Gaussian innovations, Adam for functions that do not feed back."""
+    """Gauss-Newton under Gaussian noise, else Adam for functions that do not feed back."""
     if has_innovations(model):
         return "gauss-newton"
     return "adam" if model.has_function and not model.has_feedback else "lbfgs"
@@ -189,7 +204,7 @@ def best_optima(
         steps = steps or STEPS[optimizer]
         optima = maximise(problem.target, records, starts, run, steps=steps, optimizer=optimizer)
     else:
-        steps = steps or 600
+        steps = steps or FUNCTION_STEPS[optimizer]
         optima = cascade_optima(problem, run, optimizer, steps)
     if optima[0].energy >= WALL:
         raise ValueError(
@@ -294,11 +309,12 @@ def climb(
     quiet = without_noise_below_functions(model)
     better: list[Optimum] = []
     if quiet != model and starts:
-        steps = max(1, steps // 2)
+        fast = optimizer == "gauss-newton"
+        steps = steps if fast else max(1, steps // 2)
         key = f"{prefix}without-process-noise"
         found = optima_of(quiet, [_louder(start) for start in starts], key)
-        better = found[: (len(starts) + 1) // 2]
-        starts = [grown(one.values, starts[0]) for one in better]
+        better = found[: max(1, math.ceil(len(starts) * (0.25 if fast else 0.5)))]
+        starts = [grown(one.values, _faint(starts[0])) for one in better]
     elif model.has_feedback:
         starts = [_louder(start) for start in starts]
     optima = optima_of(model, [*learnt, *starts], f"{prefix}cascade")
