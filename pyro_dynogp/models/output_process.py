@@ -136,10 +136,11 @@ class OutputProcess(TorchDistribution):
 
     @abstractmethod
     def innovations(self, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Errors of one-step predictions, their variances and log-densities, each (*batch, *event).
+        """Errors of one-step predictions, their variances, and what is not normal about them.
 
-        In units of the record, with noise. Of outputs of one time those that follow are given those
-        before. Of a missing sample they are without meaning.
+        Each (*batch, *event), in units of the record, with noise; the last is the log-density less
+        that of the normal one of these moments [nats]. Of outputs of one time those that follow are
+        given those before. Of a missing sample they are without meaning.
         """
 
     @abstractmethod

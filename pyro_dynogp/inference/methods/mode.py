@@ -133,7 +133,7 @@ class Mode:
     """The posterior mode: the best optimum of several starts.
 
     Attributes:
-        optimizer: "gauss-newton" (for linear models under Gaussian noise), "lbfgs",
+        optimizer: "gauss-newton" (under Gaussian noise), "lbfgs",
             "preconditioned" (L-BFGS in coordinates that Hessians make round, which gets to the top
             of long ridges) or "adam"; None for what suits the model, see `optimizer_for`. The
             highest mode may be one that fits the noise.

@@ -1,16 +1,17 @@
 r"""Gauss-Newton climbs of a model's posterior, from one-step predictions alone.
 
-Outputs under Gaussian noise have densities p_i given those before them. Where only the last layer's
-trajectory is unknown these are the normal densities of the innovations e_i, with variances d_i;
-after a static function that sees process noise e_i and d_i are the moments of p_i. The energy, its
-gradient and the Fisher matrix are
+Outputs under Gaussian noise have the densities of their innovations e_i, the errors of one-step
+predictions, with variances d_i. Where only the last layer's trajectory is unknown these are normal;
+else a rest r_i is added to each normal log-density. The energy, its gradient and the Fisher matrix
+(without the rest) are
 
-    E = E_prior - sum_i log p_i,     g = g_prior - sum_i (log p_i)',
-    F = sum_i e_i' e_i'^T / d_i + l_i' l_i'^T / 2,     l_i = log d_i,
+    E = E_prior + sum_i (e_i^2 / d_i + log 2 pi d_i) / 2 - r_i,
+    g = g_prior + sum_i e_i e_i' / d_i + (1 - e_i^2 / d_i) l_i' / 2 - r_i',     l_i = log d_i,
+    F = sum_i e_i' e_i'^T / d_i + l_i' l_i'^T / 2,
 
-F being that of normal densities with these moments, and primes derivatives by the unconstrained
-vector (Fahrmeir & Tutz 2001, section 8.2). These are differences over d + 1 points that go through
-the filter together, forward only; the prior has its own curvature. Each iteration tries several dampings of the step, again together, straight and bent
+primes being derivatives by the unconstrained vector (Fahrmeir & Tutz 2001, section 8.2). These are
+differences over d + 1 points that go through the filter together, forward only; the prior has its
+own curvature. Each iteration tries several dampings of the step, again together, straight and bent
 along the valleys that systems with spare pairs have: half the second derivative of e and log d
 along the step, projected back (geodesic acceleration: Transtrum & Sethna 2012, arXiv:1201.5885).
 """
@@ -80,11 +81,11 @@ class Local:
 
 
 class Innovated(NamedTuple):
-    """Of the measured samples at k points, each (k, N): errors, variances, log densities."""
+    """Of the measured samples at k points, each (k, N), as `OutputProcess.innovations` has them."""
 
     error: np.ndarray
     variance: np.ndarray
-    log_density: np.ndarray
+    rest: np.ndarray
 
 
 class Innovations:
@@ -106,16 +107,17 @@ class Innovations:
 
     def energies(self, z: np.ndarray) -> np.ndarray:
         """Energies (k,) at z (k, d); infinite where there is none."""
-        _, _, densities = self._innovations(z)
+        innovated = self._innovations(z)
         with torch.no_grad():
             prior = self._prior(torch.tensor(z)).numpy()
         with np.errstate(all="ignore"):
-            return _finite(prior - densities.sum(1))
+            return _finite(prior + _energies(innovated))
 
     def local(self, z: np.ndarray) -> Local | None:
         """Energy, gradient and curvatures at z (d,), by one-sided differences; None at an edge."""
         points = np.concatenate([z[None], z + STEP * np.eye(len(z))])
-        errors, variances, densities = self._innovations(points)
+        innovated = self._innovations(points)
+        errors, variances, rest = innovated
         x = torch.tensor(points, requires_grad=True)
         with torch.enable_grad():
             prior = self._prior(x)
@@ -124,14 +126,17 @@ class Innovations:
             sd = np.sqrt(variances[0])
             level = np.stack([errors / sd, np.log(variances) * math.sqrt(0.5)])
             slopes = (level[:, 1:] - level[:, :1]) / STEP
-            gradient = gradients[0] - (densities[1:] - densities[0]).sum(1) / STEP
-            energy = float(prior[0].detach()) - float(densities[0].sum())
+            first = level[:, 0]
+            weights = np.stack([first[0], math.sqrt(0.5) * (1.0 - first[0] ** 2)])
+            gradient = gradients[0] + sum(J @ w for J, w in zip(slopes, weights, strict=True))
+            gradient -= (rest[1:] - rest[0]).sum(1) / STEP
+            energy = float(prior[0].detach()) + float(_energies(innovated)[0])
             curvature = (gradients[1:] - gradients[0]) / STEP
             curvature = 0.5 * (curvature + curvature.T)
             fisher = sum(J @ J.T for J in slopes)
         if not all(np.isfinite(part).all() for part in (energy, gradient, fisher, curvature)):
             return None
-        return Local(energy, gradient, fisher, curvature, level[:, 0], sd, slopes)
+        return Local(energy, gradient, fisher, curvature, first, sd, slopes)
 
     def bends(self, here: Local, z: np.ndarray, moves: np.ndarray) -> np.ndarray:
         """Second derivatives along moves (k, d) from z (d,), projected on the slopes: (k, d)."""
@@ -151,7 +156,7 @@ class Innovations:
             return -self.density.prior.log_prob(self.potential.unpack(z))
 
     def _innovations(self, z: np.ndarray) -> Innovated:
-        """Errors, variances and log densities of the measured samples at z (k, d)."""
+        """Of the measured samples at z (k, d)."""
         portions = [self._portion(torch.tensor(part)) for part in
                     np.split(z, range(self.width, len(z), self.width))]  # fmt: skip
         return Innovated(*(np.concatenate(part) for part in zip(*portions, strict=True)))
@@ -172,6 +177,11 @@ class Innovations:
             halves = [self._portion(half) for half in z.tensor_split(2)]
             return Innovated(*(np.concatenate(part) for part in zip(*halves, strict=True)))
         return Innovated(*(np.concatenate(part, axis=1) for part in zip(*found, strict=True)))
+
+
+def _energies(of: Innovated) -> np.ndarray:
+    normal = of.error**2 / of.variance + np.log(2.0 * np.pi * of.variance)
+    return np.asarray((0.5 * normal - of.rest).sum(1))
 
 
 def _finite(energies: np.ndarray) -> np.ndarray:
