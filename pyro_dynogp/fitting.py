@@ -228,9 +228,10 @@ def fit(
         restarts: number of starting points (default 8 with static layers; 2 of `Trajectories`; else
             6 with random poles and, on equal steps, up to 6 of subspace identification); 0 for
             `start` alone.
-        steps: most iterations of a start (default 100 of Gauss-Newton; 500 of L-BFGS; Adam 1500;
-            cascades 600) and, with "svi", of SVI (default 1000; with static layers 60, and no more
-            while hyperparameters stay at the optimum, around which it begins all but normal).
+        steps: most iterations of a start (default 100 of Gauss-Newton, 500 of L-BFGS, 1500 of Adam;
+            with static layers 40, 600, 600) and, with "svi", of SVI (default 1000; with static
+            layers 60, and no more while hyperparameters stay at the optimum, around which it begins
+            all but normal).
         checkpoint: a folder that keeps finished pieces of the work. The same call continues from
             there after a kill, and ends in the same bits.
         workers: processes; None for all processors, 1 for none but this one.

@@ -154,24 +154,22 @@ class ExactOutputs(OutputProcess):
         jacobian = ((~missing).to(torch.float64) * self.scale.log()).sum((-2, -1))
         return (total - jacobian).expand(broadcast(z.shape[:-2], self.batch_shape))
 
-    def innovations(self, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Errors (*b, *event) of one-step predictions and their variances, in record units.
-
-        Of outputs of one time those that follow are given those before. Of a missing sample the
-        error is zero and the variance infinite.
-        """
+    def innovations(self, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """See `OutputProcess`."""
         if self.process is not None:
             error, variance = innovations(self.process, self._to_process(y))
-            if self._physical:
-                return error, variance
-            unit = self.scale if self.several else self.scale[0]
-            return unit * error, unit.square() * variance
-        mean, variance, noise = self._white
-        error, missing = self.scaled(y) - mean, torch.isnan(self.columns(y))
-        error = self.scale * error.masked_fill(missing, 0.0)
-        total = (self.scale.square() * (variance + noise)).expand(error.shape)
-        total = total.masked_fill(missing, torch.inf)
-        return (error, total) if self.several else (error.squeeze(-1), total.squeeze(-1))
+            if not self._physical:
+                unit = self.scale if self.several else self.scale[0]
+                error, variance = unit * error, unit.square() * variance
+        else:
+            mean, variance, noise = self._white
+            error, missing = self.scaled(y) - mean, torch.isnan(self.columns(y))
+            error = self.scale * error.masked_fill(missing, 0.0)
+            variance = (self.scale.square() * (variance + noise)).expand(error.shape)
+            variance = variance.masked_fill(missing, torch.inf)
+            if not self.several:
+                error, variance = error.squeeze(-1), variance.squeeze(-1)
+        return error, variance, torch.zeros_like(error)
 
     def one_step(self, y: Tensor) -> Moments:
         """See `OutputProcess`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
@@ -74,6 +75,16 @@ class MomentOutputs(OutputProcess):
             self.scale.square() * variance,
             density - self.scale.log(),
         )
+
+    def innovations(self, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """See `OutputProcess`."""
+        error, variance, density = self._pass(y, smoothing.innovate)
+        normal = -0.5 * (error.square() / variance + torch.log(2.0 * math.pi * variance))
+        found = self.scale * error, self.scale.square() * variance, density - normal
+        if self.several:
+            return found
+        error, variance, excess = (x.squeeze(-1) for x in found)
+        return error, variance, excess
 
     def one_step(self, y: Tensor) -> Moments:
         """See `OutputProcess`."""

@@ -135,6 +135,15 @@ class OutputProcess(TorchDistribution):
         """Log-density (*s, *batch) of outputs (*s, *batch, *event) [nats]."""
 
     @abstractmethod
+    def innovations(self, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Errors of one-step predictions, their variances, and what is not normal about them.
+
+        Each (*batch, *event), in units of the record, with noise; the last is the log-density less
+        that of the normal one of these moments [nats]. Of outputs of one time those that follow are
+        given those before. Of a missing sample they are without meaning.
+        """
+
+    @abstractmethod
     def one_step(self, y: Tensor) -> Moments:
         """Of each measured output (*batch, n, n_y) given those before it; with its noise.
 

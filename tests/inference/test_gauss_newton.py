@@ -1,4 +1,4 @@
-"""Gauss-Newton climbs of linear models: gradients, Fisher matrices, and where they end."""
+"""Gauss-Newton climbs: energies, gradients, Fisher matrices, and where they end."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ from pyro_dynogp.inference.optimise.gauss_newton import (
 )
 from pyro_dynogp.inference.optimise.maximum import maximise
 from pyro_dynogp.inference.run import Run
-from pyro_dynogp.inference.starts.plans import linear_starts
+from pyro_dynogp.inference.starts.plans import linear_starts, starting_points
 from pyro_dynogp.inference.starts.poles import starting_values
 from tests.inference.test_log_joint import GAPS, ONE, TWO, UNEVEN
 
@@ -41,6 +41,14 @@ CASES = {
     "varying noise, two outputs": (
         dgp.Cascade(1, (dgp.Dynamic(2, pairs=2),), dgp.Heteroscedastic(4)), TWO,
     ),
+    "Hammerstein": (dgp.Hammerstein(1, pairs=2), GAPS),
+    "Wiener": (dgp.Wiener(1, pairs=2), GAPS),
+    "Wiener without process noise": (
+        dgp.Cascade(1, (dgp.Dynamic(pairs=2, process_noise=False), dgp.Static())), (ONE, GAPS),
+    ),
+    "Wiener, two outputs": (dgp.Wiener(1, outputs=2, pairs=2), TWO),
+    "Wiener-Hammerstein": (dgp.WienerHammerstein(1, pairs=1), ONE),
+    "feedback": (dgp.NonlinearFeedback(1, pairs=1), GAPS),
 }  # fmt: skip
 
 
@@ -49,7 +57,10 @@ def prepared(name):
     model, records = CASES[name]
     target = model.scaled_to(records).collapsed
     ready = target.prepare(records)
-    (start,) = starting_values(target, ready, count=1, seed=0)
+    if target.is_linear:
+        (start,) = starting_values(target, ready, count=1, seed=0)
+    else:
+        (start,) = starting_points(target, ready, ALONE, count=1, steps=5)
     potential = Potential(target, (ready,), start)
     z = potential.pack(start).numpy()
     return Innovations(potential), z + 0.1 * np.random.default_rng(0).standard_normal(len(z))
@@ -106,7 +117,7 @@ def test_bends_are_second_derivatives():
     move = 0.02 * np.random.default_rng(1).standard_normal((1, len(z)))
 
     def level(t):
-        e, d = (part[0] for part in innovations._innovations(z + t * move))
+        e, d, _ = (part[0] for part in innovations._innovations(z + t * move))
         return np.stack([e / here.sd, np.sqrt(0.5) * np.log(d)])
 
     h = 1e-2
@@ -163,14 +174,20 @@ def test_default_starts_end_at_least_as_high_as_random_ones_by_lbfgs(record):
 def test_which_models_have_innovations():
     assert has_innovations(Linear(1))
     assert has_innovations(CASES["varying noise"][0])
-    assert not has_innovations(dgp.Wiener(1))
+    assert has_innovations(dgp.Wiener(1))
+    assert not has_innovations(dgp.Wiener(1, likelihood=dgp.StudentT()))
+    limited = dgp.Static(mean="linear", limits=(0.0, None))
+    assert not has_innovations(dgp.Cascade(1, (dgp.Dynamic(), limited)))
     assert not has_innovations(dgp.Cascade(1, (dgp.Dynamic(),), dgp.StudentT()))
     assert not has_innovations(lambda: None)
 
 
 def test_is_refused_where_there_are_none(record):
     with pytest.raises(ValueError, match=r"optimizer: expected .* got 'gauss-newton'"):
-        dgp.fit(dgp.Wiener(1), record, method="map", optimizer="gauss-newton", progress=False)
+        dgp.fit(
+            dgp.Wiener(1, likelihood=dgp.StudentT()), record, method="map",
+            optimizer="gauss-newton", progress=False,
+        )  # fmt: skip
 
 
 def test_starts_of_one_seed_give_the_same_bits_by_any_number_of_processes(record):

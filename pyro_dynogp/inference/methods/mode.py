@@ -42,6 +42,13 @@ from pyro_dynogp.support.parallel import seeded
 STEPS: Mapping[str, int] = MappingProxyType(
     {"gauss-newton": 100, "lbfgs": 500, "preconditioned": 500, "adam": 1500}
 )
+# Most iterations of models with functions.
+FUNCTION_STEPS: Mapping[str, int] = MappingProxyType(
+    {"gauss-newton": 40, "lbfgs": 600, "preconditioned": 600, "adam": 600}
+)
+# Process noise at which climbs from optima without any begin, as a share of that of a linear fit,
+# which has it explain what the functions should.
+FAINT = 0.03
 # Restarts of models with feedback. Sets of restarts, until a model with functions beats the linear
 # one in free runs, and what is said where none does.
 LOOPED = 4
@@ -67,12 +74,20 @@ def louder(values: Values) -> Values:
     }
 
 
+def _faint(values: Values) -> Values:
+    """A start whose process noise is `FAINT`."""
+    scales = ("_noise_gain_local_scale", "_integrator_noise")
+    return {
+        name: FAINT * value if name.endswith(scales) else value for name, value in values.items()
+    }
+
+
 @dataclass(frozen=True)
 class Mode:
     """The posterior mode: the best optimum of several starts.
 
     Attributes:
-        optimizer: "gauss-newton" (for linear models under Gaussian noise), "lbfgs",
+        optimizer: "gauss-newton" (under Gaussian noise), "lbfgs",
             "preconditioned" (L-BFGS in coordinates that Hessians make round, which gets to the top
             of long ridges) or "adam"; None for what suits the model, see `optimizer_for`. The
             highest mode may be one that fits the noise.
@@ -140,7 +155,7 @@ def best_optima(
         optima = maximise(problem.target, records, starts, run, steps=steps, optimizer=optimizer)
     else:
         optimizer = optimizer or optimizer_for(model)
-        optima = cascade_optima(problem, run, optimizer, steps or 600)
+        optima = cascade_optima(problem, run, optimizer, steps or FUNCTION_STEPS[optimizer])
     if optima[0].energy >= WALL:
         raise ValueError(
             "fit: no start reached a point where the likelihood can be evaluated. Check the "
@@ -235,7 +250,7 @@ def climb(
         key = f"{prefix}without-process-noise"
         found = optima_of(quiet, [louder(start) for start in starts], key)
         better = found[: (len(starts) + 1) // 2]
-        starts = [grown(one.values, starts[0]) for one in better]
+        starts = [grown(one.values, _faint(starts[0])) for one in better]
     elif model.has_feedback:
         starts = [louder(start) for start in starts]
     optima = optima_of(model, [*learnt, *starts], f"{prefix}cascade")

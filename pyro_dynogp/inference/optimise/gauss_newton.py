@@ -1,10 +1,12 @@
-r"""Gauss-Newton climbs of a linear model's posterior, from innovations alone.
+r"""Gauss-Newton climbs of a model's posterior, from one-step predictions alone.
 
-Outputs of an exact Gaussian model have the density of their innovations e_i, the errors of one-step
-predictions, with variances d_i. The energy, its gradient and the Fisher matrix are
+Outputs under Gaussian noise have the densities of their innovations e_i, the errors of one-step
+predictions, with variances d_i. Where only the last layer's trajectory is unknown these are normal;
+else a rest r_i is added to each normal log-density. The energy, its gradient and the Fisher matrix
+(without the rest) are
 
-    E = E_prior + sum_i (e_i^2 / d_i + log 2 pi d_i) / 2,
-    g = g_prior + sum_i e_i e_i' / d_i + (1 - e_i^2 / d_i) l_i' / 2,     l_i = log d_i,
+    E = E_prior + sum_i (e_i^2 / d_i + log 2 pi d_i) / 2 - r_i,
+    g = g_prior + sum_i e_i e_i' / d_i + (1 - e_i^2 / d_i) l_i' / 2 - r_i',     l_i = log d_i,
     F = sum_i e_i' e_i'^T / d_i + l_i' l_i'^T / 2,
 
 primes being derivatives by the unconstrained vector (Fahrmeir & Tutz 2001, section 8.2). These are
@@ -18,7 +20,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pyro
@@ -27,8 +29,8 @@ from torch import Tensor
 
 from pyro_dynogp.inference.log_joint import Direct
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
-from pyro_dynogp.models.exact_outputs import ExactOutputs
 from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.wiring import Static
 
 if TYPE_CHECKING:
     from pyro_dynogp.inference.density import Potential
@@ -50,8 +52,12 @@ FLAT, PATIENCE = 0.01, 8
 
 
 def has_innovations(model: object) -> bool:
-    """Whether a model's density is that of Gaussian innovations, whatever the parameters."""
-    return isinstance(model, Model) and model.is_linear and model.likelihood.gaussian
+    """Whether a model, once collapsed, is a product of predictions under Gaussian noise."""
+    if not isinstance(model, Model):
+        return False
+    last = model.layers[-1]
+    limited = isinstance(last, Static) and last.limits is not None
+    return model.likelihood.gaussian and not limited
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +80,16 @@ class Local:
     slopes: np.ndarray
 
 
+class Innovated(NamedTuple):
+    """Of the measured samples at k points, each (k, N), as `OutputProcess.innovations` has them."""
+
+    error: np.ndarray
+    variance: np.ndarray
+    rest: np.ndarray
+
+
 class Innovations:
-    """Energies of a linear model, as of `Potential` without Jacobian, and their local shape.
+    """Energies of a model, as of `Potential` without Jacobian, and their local shape.
 
     Args:
         potential: of a model for which `has_innovations` holds.
@@ -85,22 +99,25 @@ class Innovations:
         assert isinstance(potential.log_density, Direct)
         self.potential, self.density = potential, potential.log_density
         self._there = [~torch.isnan(y) for y in self.density.observations]
-        ((_, layer),) = self.density.model.dynamic
+        model = self.density.model
+        states = sum(2 * layer.modes for _, layer in model.dynamic)
+        functions = sum(layer.inducing for layer in model.layers if isinstance(layer, Static))
         samples = sum(y.numel() for y in self.density.observations)
-        self.width = max(1, KEPT // (samples * (2 * layer.modes + 4)))
+        self.width = max(1, KEPT // (samples * (4 + states + 10 * functions)))
 
     def energies(self, z: np.ndarray) -> np.ndarray:
         """Energies (k,) at z (k, d); infinite where there is none."""
-        errors, variances = self._innovations(z)
+        innovated = self._innovations(z)
         with torch.no_grad():
             prior = self._prior(torch.tensor(z)).numpy()
         with np.errstate(all="ignore"):
-            return _finite(prior + _energies(errors, variances))
+            return _finite(prior + _energies(innovated))
 
     def local(self, z: np.ndarray) -> Local | None:
         """Energy, gradient and curvatures at z (d,), by one-sided differences; None at an edge."""
         points = np.concatenate([z[None], z + STEP * np.eye(len(z))])
-        errors, variances = self._innovations(points)
+        innovated = self._innovations(points)
+        errors, variances, rest = innovated
         x = torch.tensor(points, requires_grad=True)
         with torch.enable_grad():
             prior = self._prior(x)
@@ -112,7 +129,8 @@ class Innovations:
             first = level[:, 0]
             weights = np.stack([first[0], math.sqrt(0.5) * (1.0 - first[0] ** 2)])
             gradient = gradients[0] + sum(J @ w for J, w in zip(slopes, weights, strict=True))
-            energy = float(prior[0].detach()) + float(_energies(errors[:1], variances[:1])[0])
+            gradient -= (rest[1:] - rest[0]).sum(1) / STEP
+            energy = float(prior[0].detach()) + float(_energies(innovated)[0])
             curvature = (gradients[1:] - gradients[0]) / STEP
             curvature = 0.5 * (curvature + curvature.T)
             fisher = sum(J @ J.T for J in slopes)
@@ -122,7 +140,7 @@ class Innovations:
 
     def bends(self, here: Local, z: np.ndarray, moves: np.ndarray) -> np.ndarray:
         """Second derivatives along moves (k, d) from z (d,), projected on the slopes: (k, d)."""
-        errors, variances = self._innovations(z + ALONG * moves)
+        errors, variances, _ = self._innovations(z + ALONG * moves)
         with np.errstate(all="ignore"):
             level = np.stack([errors / here.sd, np.log(variances) * math.sqrt(0.5)])
             change = (level - here.level[:, None]) / ALONG
@@ -137,35 +155,33 @@ class Innovations:
         with pyro.validation_enabled(False):
             return -self.density.prior.log_prob(self.potential.unpack(z))
 
-    def _innovations(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Errors and variances, each (k, N), of the samples that were measured at z (k, d)."""
+    def _innovations(self, z: np.ndarray) -> Innovated:
+        """Of the measured samples at z (k, d)."""
         portions = [self._portion(torch.tensor(part)) for part in
                     np.split(z, range(self.width, len(z), self.width))]  # fmt: skip
-        errors, variances = (np.concatenate(part) for part in zip(*portions, strict=True))
-        return errors, variances
+        return Innovated(*(np.concatenate(part) for part in zip(*portions, strict=True)))
 
-    def _portion(self, z: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    def _portion(self, z: Tensor) -> Innovated:
         """`_innovations` of few points; where one breaks the evaluation of all, NaN for it."""
         try:
             with torch.no_grad(), pyro.validation_enabled(False):
                 found = []
                 outputs = self.density.outputs(self.potential.unpack(z))
                 each = zip(outputs, self.density.observations, self._there, strict=True)
-                for one, y, there in each:
-                    assert isinstance(one, ExactOutputs)
-                    found.append([part[:, there].numpy() for part in one.innovations(y)])
+                for process, y, there in each:
+                    found.append([part[:, there].numpy() for part in process.innovations(y)])
         except (NotPositiveDefiniteError, torch.linalg.LinAlgError, ValueError):
             if len(z) == 1:
-                nothing = np.full((1, sum(int(one.sum()) for one in self._there)), np.nan)
-                return nothing, nothing
+                nothing = np.full((1, sum(int(there.sum()) for there in self._there)), np.nan)
+                return Innovated(nothing, nothing, nothing)
             halves = [self._portion(half) for half in z.tensor_split(2)]
-            return (np.concatenate([a for a, _ in halves]), np.concatenate([b for _, b in halves]))
-        errors, variances = (np.concatenate(part, axis=1) for part in zip(*found, strict=True))
-        return errors, variances
+            return Innovated(*(np.concatenate(part) for part in zip(*halves, strict=True)))
+        return Innovated(*(np.concatenate(part, axis=1) for part in zip(*found, strict=True)))
 
 
-def _energies(errors: np.ndarray, variances: np.ndarray) -> np.ndarray:
-    return np.asarray(0.5 * (errors**2 / variances + np.log(2.0 * np.pi * variances)).sum(1))
+def _energies(of: Innovated) -> np.ndarray:
+    normal = of.error**2 / of.variance + np.log(2.0 * np.pi * of.variance)
+    return np.asarray((0.5 * normal - of.rest).sum(1))
 
 
 def _finite(energies: np.ndarray) -> np.ndarray:

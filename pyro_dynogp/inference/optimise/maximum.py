@@ -35,6 +35,8 @@ TOGETHER, BATCH_SAMPLES = 4, 8000
 # Iterations of Gauss-Newton after which starts are ranked, and the share of them that goes on:
 # those from subspace identification rise first, others may end higher.
 RANKED = ((5, 0.75), (15, 0.5), (30, 0.5))
+# The same of models with static functions, whose starts are fewer and part earlier.
+RANKED_FUNCTIONS = ((4, 0.5), (10, 0.5))
 
 
 @dataclass(frozen=True)
@@ -268,7 +270,10 @@ def maximise(
     if len(starts) == 1:
         return climb(starts, steps, "optimum")
     behind: list[Optimum] = []
-    (first, _), *further = _stages(optimizer, steps, effort.kept)
+    ranked: Sequence[tuple[int, float]] = ((max(1, steps // 5), effort.kept),)
+    if optimizer == "gauss-newton":
+        ranked = RANKED_FUNCTIONS if getattr(model, "has_function", False) else RANKED
+    (first, _), *further = _stages(ranked, steps, effort.kept)
     leading = best_first(climb(starts, first, "starts"))
     for stage, (count, kept) in enumerate(further):
         cut = max(1, math.ceil(kept * len(leading) - 0.5))
@@ -282,9 +287,10 @@ def maximise(
     return best_first([*leading, *behind])
 
 
-def _stages(optimizer: Optimizer, steps: int, kept: float) -> list[tuple[int, float]]:
+def _stages(
+    ranked: Sequence[tuple[int, float]], steps: int, kept: float
+) -> list[tuple[int, float]]:
     """Steps of each stage, and the share of the starts that takes them, all of them at first."""
-    ranked = RANKED if optimizer == "gauss-newton" else ((max(1, steps // 5), kept),)
     ends = [min(end, steps) for end, _ in ranked] + [steps]
     shares = [1.0, *(max(kept, share) for _, share in ranked)]
     counts = np.diff([0, *ends]).tolist()

@@ -320,12 +320,17 @@ def linear_starts(
 
 
 def optimizer_for(model: Model) -> Optimizer:
-    """Gauss-Newton for Gaussian innovations, Adam for functions that do not feed back."""
-    if has_innovations(model):
-        return "gauss-newton"
-    return "adam" if model.has_function and not model.has_feedback else "lbfgs"
+    """Gauss-Newton for linear models under Gaussian noise, Adam for functions, else L-BFGS.
+
+    Of models with functions Gauss-Newton finds higher modes, but with output scales and short
+    lengthscales that make the functions less certain than they are.
+    """
+    if model.has_function:
+        return "lbfgs" if model.has_feedback else "adam"
+    return "gauss-newton" if has_innovations(model) else "lbfgs"
 
 
 def optimizer_near(model: Model) -> Optimizer:
     """The optimizer that goes on from near an optimum."""
-    return "gauss-newton" if has_innovations(model) else "preconditioned"
+    near = has_innovations(model) and not model.has_function
+    return "gauss-newton" if near else "preconditioned"
