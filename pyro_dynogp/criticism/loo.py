@@ -13,6 +13,7 @@ from pyro_dynogp.criticism.posterior_draws import DRAWS
 from pyro_dynogp.criticism.subjects import FitSubject, Parameters, Subject
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.records import as_records
+from pyro_dynogp.inference.pareto import good_k
 from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
@@ -136,7 +137,7 @@ def _elpd(subject: Subject, found: Found, target: str, horizon: int) -> Any:
     count = len(subject.draws)
     if found.left:
         found.notes.append(
-            f"{found.left} samples have a Pareto k above {arviz_bridge.good_k(count):.2f} and were "
+            f"{found.left} samples have a Pareto k above {good_k(count):.2f} and were "
             "not fitted again: raise `refits`, or use target='new record'."
         )
     order = np.argsort(found.index)

@@ -12,6 +12,7 @@ from torch import Tensor
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.methods.base import Problem
+from pyro_dynogp.inference.methods.importance import with_draws_around
 from pyro_dynogp.inference.methods.mode import optimizer_for
 from pyro_dynogp.inference.methods.nuts import sample_posterior
 from pyro_dynogp.inference.methods.optima import POLISH, Hyperparameters, posterior_of
@@ -77,6 +78,11 @@ def refit(fit: FittedKind, records: Record | Sequence[Record]) -> FittedKind:
         draws = {name: value.unsqueeze(0) for name, value in best.values.items()}
         changed |= {"posterior": Mixture.at(best.values), "draws": FrozenMapping(draws)}
         return replace(fit, **changed)
+    if fit.method == "importance":
+        count = len(next(iter(fit.draws.values())))
+        around = with_draws_around(problem, optima, run, count)
+        kept = ("posterior", "draws", "mode", "history", "records", "diagnostics")
+        return replace(fit, **{name: getattr(around, name) for name in kept})
     if fit.method == "nuts":
         sampled = FrozenMapping(_sampled(fit, problem, best, run))
         return replace(fit, posterior=Sampled(sampled), draws=sampled, **changed)

@@ -43,6 +43,8 @@ CRITICAL = 0.02
 # Decay rates below this many per record are unlikely a priori: in 1/SETTLING of the record such a
 # mode has decayed to a third.
 SETTLING = 10.0
+# Samples below which a record is short: it may show a part of what the system does.
+SHORT = 100.0
 # Standard deviation of a prior that is flat for all practical purposes.
 FLAT = 1e3
 # What is left of new noise gains where a model is extended: not nothing, since at zero the density
@@ -72,6 +74,15 @@ class TimeScale:
     def rate_bounds(self) -> tuple[float, float]:
         """Logarithms of the slowest and fastest rates [1/s] that the record can show."""
         return math.log(1.0 / self.duration), math.log(math.pi / self.step)
+
+    @property
+    def brevity(self) -> float:
+        """How much wider a short record has priors of slow poles, gains and offset; 1 for others.
+
+        With few samples a system may well be slower than the record is long, and its outputs go far
+        beyond those measured. `SHORT` over the number of steps, and at least one.
+        """
+        return max(1.0, SHORT * self.step / self.duration)
 
     @property
     def typical_rate(self) -> float:
@@ -183,13 +194,13 @@ class ModesPrior:
             return tuple(dims.get(dim, dim) for dim in generic)
 
         name, P, n_u = self.name, self.pairs, self.inputs
-        flat = self.priors == "paper"
+        flat, wide = self.priors == "paper", self.time_scale.brevity
         sites = [*self._pole_sites(named("pair"))]
         if n_u:
             gain = (
                 _normal(FLAT, P, n_u, 2)
                 if flat
-                else SharedScaleNormal(GAIN_FREEDOM, self.gain_scale, (P, n_u, 2), apart=1)
+                else SharedScaleNormal(GAIN_FREEDOM, wide * self.gain_scale, (P, n_u, 2), apart=1)
             )
             over = named("pair", "input", "term")
             sites.append(Site(f"{name}_input_gain", gain, over, growth=0.0))
@@ -222,7 +233,7 @@ class ModesPrior:
         else:
             half = 0.5 * (high - low)
             top = torch.full((self.pairs,), half, dtype=torch.float64)
-            settling = torch.full_like(top, SETTLING / math.exp(half))
+            settling = torch.full_like(top, SETTLING / self.time_scale.brevity / math.exp(half))
             decay = LogDecayRate(settling, top).to_event(1)
             bottom = torch.full_like(top, -half - math.log(10.0))
             frequency = dist.Uniform(bottom, top).to_event(1)
