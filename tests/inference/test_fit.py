@@ -59,9 +59,9 @@ class TestMap:
 
     def test_same_seed_same_bits_here_and_in_processes(self, record, map_fit):
         model = dgp.LinearDynamicGP(inputs=1, pairs=1)
-        options = {"restarts": 2, "progress": False}
-        assert same(map_fit, dgp.fit(model, record[:160], workers=1, **options, method="map"))
-        assert same(map_fit, dgp.fit(model, record[:160], workers=2, **options, method="map"))
+        options = {"restarts": 2, "progress": False, "method": "map"}
+        assert same(map_fit, dgp.fit(model, record[:160], workers=1, **options))
+        assert same(map_fit, dgp.fit(model, record[:160], workers=2, **options))
 
     def test_global_random_state_and_parameter_store_are_left_alone(self, record):
         pyro.get_param_store().clear()
@@ -89,8 +89,8 @@ class TestMap:
         )
         model = dgp.LinearDynamicGP(inputs=1, pairs=1)
         options = {"method": "svi", "restarts": 2, "steps": 60, "draws": 40}
-        second = dgp.fit(model, other, workers=1, progress=False, **options, method="map")
-        again = dgp.fit(model, record[:160], workers=1, progress=False, **options, method="map")
+        second = dgp.fit(model, other, workers=1, progress=False, **options)
+        again = dgp.fit(model, record[:160], workers=1, progress=False, **options)
         assert same(again, svi_fit)
         assert not same(again, second)
 
@@ -133,10 +133,10 @@ class TestSeveralRecords:
     @pytest.mark.parametrize("initial_state", ["integrated", "site"])
     def test_a_sequence_of_one_record_is_that_record(self, record, initial_state):
         model = dgp.LinearDynamicGP(inputs=1, pairs=1, initial_state=initial_state)
-        options = {"restarts": 1, "steps": 20, "workers": 1, "progress": False}
+        options = {"restarts": 1, "steps": 20, "workers": 1, "progress": False, "method": "map"}
         assert same(
-            dgp.fit(model, [record[:80]], **options, method="map"),
-            dgp.fit(model, record[:80], **options, method="map"),
+            dgp.fit(model, [record[:80]], **options),
+            dgp.fit(model, record[:80], **options),
         )
 
     def test_missing_outputs_are_integrated_out(self, one_pair):
@@ -244,9 +244,9 @@ def test_summary_names_poles_and_noise(map_fit):
 class TestWarmStart:
     def test_goes_on_from_another_fit(self, record, map_fit):
         model = dgp.LinearDynamicGP(inputs=1, pairs=1)
-        options = {"restarts": 1, "steps": 2, "workers": 1, "progress": False}
-        cold = dgp.fit(model, record[:160], **options, method="map")
-        warm = dgp.fit(model, record[:160], start=map_fit, **options, method="map")
+        options = {"restarts": 1, "steps": 2, "workers": 1, "progress": False, "method": "map"}
+        cold = dgp.fit(model, record[:160], **options)
+        warm = dgp.fit(model, record[:160], start=map_fit, **options)
         assert warm.start_energies[0] <= map_fit.start_energies[0] + 1e-6
         assert warm.start_energies[0] < cold.start_energies[0] - 1.0
 

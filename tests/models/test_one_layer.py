@@ -24,10 +24,8 @@ def both():
     options = {"method": "svi", "draws": 20, **QUICK}
     return SimpleNamespace(
         record=record,
-        linear=dgp.fit(dgp.LinearDynamicGP(1, pairs=1), record[:100], **options, method="map"),
-        cascade=dgp.fit(
-            dgp.Cascade(1, (dgp.Dynamic(pairs=1),)), record[:100], **options, method="map"
-        ),
+        linear=dgp.fit(dgp.LinearDynamicGP(1, pairs=1), record[:100], **options),
+        cascade=dgp.fit(dgp.Cascade(1, (dgp.Dynamic(pairs=1),)), record[:100], **options),
     )
 
 
