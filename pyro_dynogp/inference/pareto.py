@@ -58,7 +58,8 @@ def _smooth(x: np.ndarray) -> float:
     k, sigma = fit_tail(np.exp(x[tail]) - np.exp(cutoff))
     if np.isfinite(k) and sigma > 0.0:
         above = np.log1p(-np.arange(0.5, len(tail)) / len(tail))
-        excess = sigma * (np.expm1(-k * above) / k if abs(k) > 1e-15 else -above)
+        with np.errstate(over="ignore"):  # what is out of range is as large as the largest
+            excess = sigma * (np.expm1(-k * above) / k if abs(k) > 1e-15 else -above)
         x[tail] = np.minimum(np.log(excess + np.exp(cutoff)), 0.0)
     return k
 

@@ -2,9 +2,9 @@
 
 Linear systems of one or two modes, real or oscillating, time constants of 2 to 25 samples, driven
 by white noise, steps or a multisine; half of them have a feedthrough, half have process noise;
-noise of 5 to 20 % of the output. Forecasts of the 100 samples after a training record of n. Environment
-variables make a run shorter: COVERAGE_SYSTEMS (40), COVERAGE_SAMPLES (12,30,60,100,200,500),
-COVERAGE_MODELS (linear,wiener,feedback).
+noise of 5 to 20 % of the output. Forecasts of the 100 samples after a training record of n.
+Environment variables make a run shorter: COVERAGE_SYSTEMS (40), COVERAGE_SAMPLES
+(12,30,60,100,200,500), COVERAGE_MODELS (linear,wiener,feedback).
 """
 
 from __future__ import annotations
