@@ -57,8 +57,8 @@ def loo(
         begin: of "forecast": first sample that is scored, a number of samples or a share of the
             record.
         folds: of "new record", contiguous blocks of a single record.
-        draws: of the posterior (of NUTS all). They are kept with the fit: a second call, another
-            target and `check` take the same ones.
+        draws: of the posterior; of fits by importance or NUTS those that the fit holds, which
+            `check` and every target take.
         parameters: "posterior", or "mode" for densities with all parameters at the mode, which has
             seen the data: O(n) and quick, and kind to models of many parameters. For records so
             long that parameters are all but known.
