@@ -11,15 +11,17 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.criticism.finding import apart
-from pyro_dynogp.inference import importance_sampling
 from pyro_dynogp.inference.cascade_coordinates import StraightPotential
 from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.importance_sampling import sample_around, samples_of, systematic
 from pyro_dynogp.inference.log_joint import log_joint_of
+from pyro_dynogp.inference.methods.annealed import Joint, anneal
 from pyro_dynogp.inference.pareto import good_k, psis
 from pyro_dynogp.inference.posterior_draws import PosteriorDraws
 from pyro_dynogp.inference.posteriors import Draws, Mixture, Sampled
 from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import seeded
 
 if TYPE_CHECKING:
@@ -66,7 +68,7 @@ def draws_of(
             advice="Fit with method='svi' (the default of cascades) or 'nuts', or use "
             "parameters='mode'.",
         )
-    found = importance_sampling.sample_around(
+    found = sample_around(
         fit.model.collapsed, _data(fit), [fit.mode], count=count, seed=seed, progress=progress
     ).draws
     return replace(found, kind=f"{found.kind}; {own.kind} has Pareto k {shape}")
@@ -128,7 +130,10 @@ def normal_of(fit: Fitted) -> Mixture:
 def carried(
     old: Fitted, draws: PosteriorDraws, new: Fitted, *, seed: int, progress: bool = False
 ) -> PosteriorDraws:
-    """Draws of a fit's posterior moved to that of the same model given other data.
+    """Draws of a posterior moved to that given other data, without a fit (Chopin 2002).
+
+    Particles are annealed from the one to the other; draws of another density are resampled by
+    their ratios first.
 
     Args:
         old: a fit without static functions. draws: of its posterior.
@@ -136,14 +141,25 @@ def carried(
     """
     before = StraightPotential(old.model.collapsed, (_data(old),), old.mode)
     after = before.on((_data(new),))
-    samples = importance_sampling.samples_of(_data(old))
-    return importance_sampling.carried(before, after, draws, samples, seed=seed, progress=progress)
+    start, target = (
+        Joint(potential, samples_of(_data(fit))) for potential, fit in ((before, old), (after, new))
+    )
+    count = len(draws)
+    shift = float(np.random.default_rng(seed).random())
+    first = systematic(np.exp(psis(draws.log_ratio)[0]), count, shift)
+    z = before.pack(draws.values)[first]
+    found = anneal(z, start, target, seed=seed, progress=progress)
+    with torch.no_grad():
+        values = FrozenMapping(after.unpack(found.z))
+    roots = np.arange(count) if draws.ancestor is None else draws.ancestor
+    kind, group = "annealed from draws given other data", np.zeros(count, dtype=int)
+    return PosteriorDraws(values, None, None, group, kind, roots[first[found.ancestor]])
 
 
 def log_joint(fit: Fitted, values: Values) -> np.ndarray:
     """Log p(y, values) (S,) of draws, y the training records; -inf where it has no value."""
     records = _data(fit)
-    samples = importance_sampling.samples_of(records)
+    samples = samples_of(records)
     return log_joint_of(fit.model.collapsed, (records,), values, samples)
 
 

@@ -222,32 +222,6 @@ def distinct(potential: Potential, optima: Sequence[Values]) -> list[Values]:
     return [optima[index] for index in kept]
 
 
-def carried(
-    before: StraightPotential, after: StraightPotential, draws: PosteriorDraws, samples: int,
-    *, seed: int, progress: bool = False,
-) -> PosteriorDraws:  # fmt: skip
-    """Draws of a posterior moved to that given other data, without a fit (Chopin 2002).
-
-    Particles are annealed from the one to the other; draws of another density are resampled by
-    their ratios first.
-
-    Args:
-        before, after: the densities, in the same coordinates. draws: of the first.
-        samples: of the longer data. seed: of the moves. progress: whether to show a bar.
-    """
-    start, target = Joint(before, samples), Joint(after, samples)
-    count = len(draws)
-    shift = float(np.random.default_rng(seed).random())
-    first = systematic(np.exp(psis(draws.log_ratio)[0]), count, shift)
-    z = before.pack(draws.values)[first]
-    found = anneal(z, start, target, seed=seed, progress=progress)
-    with torch.no_grad():
-        values = FrozenMapping(after.unpack(found.z))
-    roots = np.arange(count) if draws.ancestor is None else draws.ancestor
-    kind, group = "annealed from draws given other data", np.zeros(count, dtype=int)
-    return PosteriorDraws(values, None, None, group, kind, roots[first[found.ancestor]])
-
-
 def samples_of(records: Sequence[PreparedRecord]) -> int:
     """Measured numbers of all records."""
     return sum(record.observations.numel() for record in records)
