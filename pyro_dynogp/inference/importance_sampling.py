@@ -96,7 +96,7 @@ def draws_for(samples: int) -> int:
 
 
 def can_anneal(model: Model, samples: int) -> bool:
-    """Whether annealing takes no longer than a fit does.
+    """Whether annealing can be afforded, at some 30 densities a draw.
 
     Not where static functions make every density a run of the moment-matching filter, nor along
     records so long that parameters are all but known.
@@ -133,21 +133,18 @@ def sample_around(
         log_weights, shape = psis((log_target - log_proposal).numpy())
         k, kind = float(shape), f"Student-t around {plural(len(weights))}"
         ancestor, log_q = None, log_proposal
-        annealed = not k <= good_k(count) and can_anneal(model, samples)
-        if annealed:
-            islands = [anneal(z, proposal, target, seed=seed, progress=progress)]
-            kind = f"annealed from {kind}"
-            if samples <= SHORT and isinstance(potential.log_density, Direct):
-                # In plain coordinates: the straight ones are for the neighbourhood of an optimum.
+        islands: list[Annealed] = []
+        if not k <= good_k(count) and can_anneal(model, samples):
+            islands = run_of(proposal, z, target, seed, progress)
+            if samples <= SHORT and model.priors == "default":
                 plain = Potential(model, (records,), leading[0])
-                prior = Prior(plain, potential.log_density)
-                found = anneal(
-                    prior.draw(count, seed), prior, Joint(plain, samples), seed=seed,
-                    progress=progress,
-                )  # fmt: skip
+                found = from_prior(plain, count, samples, seed, progress)
                 with torch.no_grad():
-                    islands.append(replace(found, z=potential.pack(plain.unpack(found.z))))
-                kind += " and from the prior"
+                    islands += [replace(x, z=potential.pack(plain.unpack(x.z))) for x in found]
+                kind += " and from the prior" if found else ""
+        annealed = bool(islands)
+        if annealed:
+            kind = f"annealed from {kind}"
             z, ancestor = pooled(islands, count)
             log_target = target(z)[0]
             log_weights = np.full(count, -np.log(count))
@@ -163,6 +160,27 @@ def sample_around(
         ancestor,
     )
     return Sampled(draws, log_weights, k, len(weights), annealed, leading[0])
+
+
+def run_of(
+    start: StudentMixture | Prior, z: Tensor, target: Joint, seed: int, progress: bool
+) -> list[Annealed]:
+    """One run of annealing; none where particles cannot get from the start to the posterior."""
+    try:
+        return [anneal(z, start, target, seed=seed, progress=progress)]
+    except RuntimeError:  # Pareto's k of the draws that there are then says how good they are
+        return []
+
+
+def from_prior(
+    potential: Potential, count: int, samples: int, seed: int, progress: bool
+) -> list[Annealed]:
+    """Particles annealed from the prior: straight coordinates serve around an optimum alone."""
+    density = potential.log_density
+    assert isinstance(density, Direct)  # of a model whose trajectories are integrated out
+    prior = Prior(potential, density)
+    z = prior.draw(count, seed)
+    return run_of(prior, z, Joint(potential, samples), seed, progress)
 
 
 def pooled(islands: Sequence[Annealed], count: int) -> tuple[Tensor, np.ndarray]:

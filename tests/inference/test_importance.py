@@ -280,3 +280,24 @@ def test_options():
     with pytest.raises(ValueError, match="draws: expected a whole number >= 1"):
         dgp.Importance(draws=0)
     assert dataclasses.astuple(dgp.Importance()) == (300, None)
+
+
+def test_where_annealing_gets_nowhere(fit, monkeypatch):
+    """The draws of the proposal stay, and their k says what they are worth."""
+
+    def fails(*args, **options):
+        raise RuntimeError("annealing: after 60 steps")
+
+    records = tuple(fit.model.prepare(fit.records))
+    monkeypatch.setattr(importance_sampling, "good_k", lambda count: -1.0)
+    monkeypatch.setattr(importance_sampling, "anneal", fails)
+    found = sample_around(fit.model.collapsed, records, [fit.mode], count=60)
+    assert not found.annealed
+    assert found.draws.log_q is not None
+    assert found.draws.kind == "Student-t around the mode"
+
+
+def test_flat_priors_are_no_start(fit, record):
+    model = dataclasses.replace(MODEL, priors="paper")
+    found = dgp.fit(model, record[:60], **QUICK)
+    assert "prior" not in found.posterior.kind
