@@ -207,7 +207,7 @@ def test_nuts_one_pair_of_300_samples(one_pair):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"method": "mcmc"}, "method: expected 'map', 'svi' or 'nuts'"),
+        ({"method": "mcmc"}, "method: expected 'importance', 'map', 'svi' or 'nuts'"),
         (
             {"optimizer": "sgd"},
             "optimizer: expected 'gauss-newton', 'lbfgs', 'preconditioned' or 'adam'",
