@@ -39,6 +39,7 @@ if TYPE_CHECKING:  # the same names, for editors and type checkers; a test compa
     from pyro_dynogp.guides.families import GaussMarkov as GaussMarkov
     from pyro_dynogp.guides.families import InducingTimes as InducingTimes
     from pyro_dynogp.guides.layer_guide import LayerGuide as LayerGuide
+    from pyro_dynogp.inference.methods.importance import Importance as Importance
     from pyro_dynogp.inference.methods.mode import Mode as Mode
     from pyro_dynogp.inference.methods.nuts import Nuts as Nuts
     from pyro_dynogp.inference.methods.optima import Normal as Normal
@@ -78,6 +79,7 @@ HOMES = {
     "fit": "fitting",
     "load": "fitting",
     "Fit": "fitting",
+    "Importance": "inference.methods.importance",
     "Mode": "inference.methods.mode",
     "Normal": "inference.methods.optima",
     "Nuts": "inference.methods.nuts",

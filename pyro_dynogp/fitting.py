@@ -208,8 +208,9 @@ def fit(
     """Fit a model to one record, or to several that share all parameters.
 
     The marginal posterior (exact for a linear model, by the moment-matching filter for others) is
-    climbed from several starts, in parallel. `Mode` ("map") keeps the best optimum; `Normal`
-    ("svi") fits normals to the posterior around the best optima; `Nuts` ("nuts") samples it. The
+    climbed from several starts, in parallel. `Importance` ("importance") draws all parameters from
+    around the optima; `Mode` ("map") keeps the best optimum alone; `Normal` ("svi") fits normals to
+    the posterior around the best optima; `Nuts` ("nuts") samples it. The
     starts of a cascade are the best linear fits, spread over its layers; where static layers see
     process noise they climb without any first, and the better half continues with it. Free runs
     through the training record decide whether it stays, and leave out optima that run worse than
@@ -220,8 +221,9 @@ def fit(
     Args:
         model: a `LinearDynamicGP` or a `Cascade` (`Wiener`, `Hammerstein`, ...).
         record: training record, or a sequence of them; scaling is learnt from it alone.
-        method: "map", "svi", "nuts", or an object with options of its own: `Mode`, `Normal`,
-            `Nuts`, `Trajectories`. By default "svi" where the model has static layers, else "map".
+        method: "importance", "map", "svi", "nuts", or an object with options of its own:
+            `Importance`, `Mode`, `Normal`, `Nuts`, `Trajectories`. By default "svi" where the model
+            has static layers, else "importance".
         start: a fit to start from beside the restarts: of the same model to other data, or of a
             model that this one extends (what sites have in common is taken over).
         seed: the same seed gives the same numbers to the last bit on one machine.

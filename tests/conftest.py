@@ -51,7 +51,7 @@ def record(one_pair):
 @pytest.fixture(scope="session")
 def map_fit(record):
     model = dgp.LinearDynamicGP(inputs=1, pairs=1)
-    return dgp.fit(model, record[:160], restarts=2, workers=1, progress=False)
+    return dgp.fit(model, record[:160], restarts=2, workers=1, progress=False, method="map")
 
 
 @pytest.fixture(scope="session")
@@ -79,4 +79,6 @@ def two_outputs():
 @pytest.fixture(scope="session")
 def two_output_fit(two_outputs):
     model = dgp.LinearDynamicGP(inputs=2, outputs=2, pairs=2)
-    return dgp.fit(model, two_outputs[:160], restarts=2, steps=120, workers=1, progress=False)
+    return dgp.fit(
+        model, two_outputs[:160], restarts=2, steps=120, workers=1, progress=False, method="map"
+    )

@@ -19,7 +19,14 @@ SHORT = ("circuit", "drives_1", "drives_2", "electricity")
 
 def test_scores_of_samples_are_those_of_the_library():
     data = dgp.datasets.load("coupled_drives")
-    fit = dgp.fit(dgp.LinearDynamicGP(1, pairs=2), data.train, restarts=2, steps=60, progress=False)
+    fit = dgp.fit(
+        dgp.LinearDynamicGP(1, pairs=2),
+        data.train,
+        restarts=2,
+        steps=60,
+        progress=False,
+        method="map",
+    )
     forecast = fit.forecast(data.train, data.test, samples=4000)
     samples = np.asarray(forecast.samples)[:, :, 0]
     found = scores(Predicted(forecast.mean[:, 0], samples), data.test.outputs[:, 0], skip=4)

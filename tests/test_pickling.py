@@ -142,7 +142,7 @@ def small_report():
     record = dgp.Record(np.arange(480.0), u, y)
     model = dgp.LinearDynamicGP(1, pairs=1, process_noise=False)
     quick = {"workers": 1, "progress": False}
-    fit = dgp.fit(model, record[:240], restarts=1, steps=40, **quick)
+    fit = dgp.fit(model, record[:240], restarts=1, steps=40, **quick, method="map")
     return dgp.close_loop(fit, record, effects=(LevelShift(),), max_rounds=1, **quick)
 
 

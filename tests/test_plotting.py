@@ -55,7 +55,9 @@ def record():
 @pytest.fixture(scope="module")
 def map_fit(record):
     model = dgp.LinearDynamicGP(inputs=1, pairs=1)
-    return dgp.fit(model, record[:80], restarts=1, steps=25, workers=1, progress=False)
+    return dgp.fit(
+        model, record[:80], restarts=1, steps=25, workers=1, progress=False, method="map"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +73,9 @@ def wide_fit():
     y = np.cumsum(u, axis=0) * 0.2 + rng.normal(size=(60, 2))
     model = dgp.LinearDynamicGP(inputs=2, outputs=2, pairs=1)
     record = dgp.Record(np.arange(60.0), u, y)
-    return dgp.fit(model, record, restarts=1, steps=3, workers=1, progress=False), record
+    return dgp.fit(
+        model, record, restarts=1, steps=3, workers=1, progress=False, method="map"
+    ), record
 
 
 def line(axes, label):

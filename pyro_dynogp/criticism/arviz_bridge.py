@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from pyro_dynogp.inference.pareto import good_k
+
 
 def _arviz() -> Any:
     """ArviZ, imported when it is first needed: it takes seconds."""
@@ -17,35 +19,6 @@ def _arviz() -> Any:
         warnings.simplefilter("ignore", FutureWarning)
         import arviz
     return arviz
-
-
-def good_k(draws: int) -> float:
-    """Largest Pareto shape at which importance sampling with S draws is reliable (Vehtari 2024)."""
-    return min(1.0 - 1.0 / np.log10(draws), 0.7) if draws > 10 else 0.0
-
-
-def psis(log_ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pareto-smoothed importance sampling (Vehtari, Simpson, Gelman, Yao & Gabry 2024).
-
-    Args:
-        log_ratio: (..., S) of target over proposal, up to a constant for each row.
-
-    Returns:
-        Normalised log weights (..., S), and Pareto shapes k (...); NaN with fewer than 25 draws
-        and zero where all ratios of a row are equal.
-    """
-    log_ratio = np.asarray(log_ratio, dtype=float)
-    count = log_ratio.shape[-1]
-    flat = log_ratio.reshape(-1, count)
-    flat = flat - flat.max(-1, keepdims=True)
-    out = flat - np.log(np.exp(flat).sum(-1, keepdims=True))
-    k = np.full(len(flat), np.nan)
-    equal = np.ptp(flat, axis=-1) < 1e-12
-    k[equal] = 0.0
-    if count >= 25 and not equal.all():
-        smoothed, shape = _arviz().psislw(flat[~equal].copy())
-        out[~equal], k[~equal] = smoothed, np.atleast_1d(shape)
-    return out.reshape(log_ratio.shape), k.reshape(log_ratio.shape[:-1])
 
 
 def elpd_data(

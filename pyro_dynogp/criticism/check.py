@@ -9,13 +9,15 @@ import numpy as np
 import pyro
 import torch
 
-from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.calibration import calibration
 from pyro_dynogp.criticism.finding import Finding, apart
-from pyro_dynogp.criticism.posterior_draws import DRAWS, PosteriorDraws, draws_of, log_joint_of
+from pyro_dynogp.criticism.posterior_draws import DRAWS, draws_of
 from pyro_dynogp.criticism.twin import twin_findings
 from pyro_dynogp.inference.fitted import known_fit
 from pyro_dynogp.inference.isolation import isolated
+from pyro_dynogp.inference.log_joint import log_joint_of
+from pyro_dynogp.inference.pareto import good_k, psis
+from pyro_dynogp.inference.posterior_draws import PosteriorDraws
 from pyro_dynogp.inference.stability import warnings_of
 from pyro_dynogp.prediction.predict import predict
 
@@ -128,8 +130,8 @@ def check(
 
 def _posterior(fit: Fitted, draws: int, seed: int) -> Finding:
     own = draws_of(fit, count=draws, seed=seed, anneal=False)
-    k = float(arviz_bridge.psis(own.log_ratio)[1])
-    good = arviz_bridge.good_k(len(own))
+    k = float(psis(own.log_ratio)[1])
+    good = good_k(len(own))
     found, limit = apart(k, good)
     if not np.isfinite(k) or k > good:
         text = (
@@ -152,7 +154,7 @@ def _whole_vector(fit: Fitted) -> Finding:
         log_p = log_joint_of(fit.model, (argument,), values, samples)
     log_q = torch.stack(list(fit.log_q_sites.values())).sum(0).numpy()
     ratio = PosteriorDraws(values, log_p, log_q, np.zeros(len(log_q), dtype=int), "").log_ratio
-    k = float(arviz_bridge.psis(ratio)[1])
+    k = float(psis(ratio)[1])
     text = "all sites together, trajectories too: informs, high in many dimensions"
     return Finding("whole-vector k", k, None, text)
 

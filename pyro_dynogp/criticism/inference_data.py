@@ -16,7 +16,7 @@ from torch import Tensor
 from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.labelled import Coordinate, Variable, clock_of, dataset_of, units_of
 from pyro_dynogp.criticism.physical import physical_quantities
-from pyro_dynogp.criticism.posterior_draws import PosteriorDraws, judged
+from pyro_dynogp.criticism.posterior_draws import judged
 from pyro_dynogp.criticism.site_dimensions import (
     dimensions_for,
     labels_of,
@@ -26,6 +26,8 @@ from pyro_dynogp.criticism.site_dimensions import (
 from pyro_dynogp.criticism.subjects import densities_at
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.records import one_record
+from pyro_dynogp.inference.pareto import good_k, psis
+from pyro_dynogp.inference.posterior_draws import PosteriorDraws
 from pyro_dynogp.models.output_process import OutputProcess
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.prediction.first_state import beginning
@@ -225,10 +227,10 @@ class _Export:
 
 def pareto_attrs(draws: PosteriorDraws) -> dict[str, Any]:
     """Pareto shape of the importance ratios of the draws, and from where on it is too large."""
-    _, k = arviz_bridge.psis(draws.log_ratio)
+    _, k = psis(draws.log_ratio)
     return {
         "pareto_k": float(k),
-        "pareto_k_good_below": float(arviz_bridge.good_k(len(draws))),
+        "pareto_k_good_below": float(good_k(len(draws))),
     }
 
 

@@ -17,8 +17,8 @@ import numpy as np
 from scipy.special import logsumexp
 from tqdm import trange
 
-from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.subjects import FitSubject, Subject
+from pyro_dynogp.inference.pareto import good_k, psis
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.parallel import parallel_map
 
@@ -46,8 +46,8 @@ class Base:
         """Ratios, or none where the posterior's own k says that they are not to be trusted."""
         draws = subject.draws
         ratio, ancestor = draws.log_ratio, draws.ancestor
-        log_weights, k = arviz_bridge.psis(ratio)
-        if k <= arviz_bridge.good_k(len(ratio)):
+        log_weights, k = psis(ratio)
+        if k <= good_k(len(ratio)):
             return cls(ratio, log_weights, float(k), True, ancestor)
         plain = np.full(len(ratio), -np.log(len(ratio)))
         return cls(np.zeros_like(ratio), plain, float(k), False, ancestor)
@@ -113,7 +113,7 @@ def missing_sample(subject: Subject, most: int, workers: int | None, progress: b
     """Each sample given all others, by importance sampling; by refits where that does not do."""
     density = subject.pointwise("missing sample")
     base = Base.of(subject)
-    log_weights, k = arviz_bridge.psis(base.log_ratio - density.T)
+    log_weights, k = psis(base.log_ratio - density.T)
     elpd = mixture(log_weights, density)
     whole = base.log_weights
     lppd = float(mixture(np.broadcast_to(whole, log_weights.shape), density).sum())
@@ -121,7 +121,7 @@ def missing_sample(subject: Subject, most: int, workers: int | None, progress: b
     N = density.shape[1]
     found = Found(base, np.arange(N), elpd, k, lppd, error)
     _note(found, subject)
-    high = np.flatnonzero(k > arviz_bridge.good_k(len(whole)))
+    high = np.flatnonzero(k > good_k(len(whole)))
     worst = high[np.argsort(-k[high])][:most]
     found.left = len(high) - len(worst)
     if len(worst):
@@ -179,7 +179,7 @@ def forecast(
     if len(whole) == 1:  # one draw weighs what it weighs, whatever is left out
         found.elpd = target[0, scored]
         return found
-    good = arviz_bridge.good_k(len(whole))
+    good = good_k(len(whole))
     shares: list[np.ndarray] = []  # influences on forecasts of the draws since the last fit
     errors: list[float] = []
     current = base
@@ -231,7 +231,7 @@ def _given(base: Base, step: np.ndarray, known: int, end: int) -> tuple[np.ndarr
         ratio = base.log_ratio + step[:, end:known].sum(1)
     else:
         ratio = base.log_ratio - step[:, known:end].sum(1)
-    log_weights, k = arviz_bridge.psis(ratio)
+    log_weights, k = psis(ratio)
     return log_weights, float(k)
 
 
@@ -263,7 +263,7 @@ def new_record(subject: Subject, folds: int, workers: int | None, progress: bool
     lppd = sum(float(_chain(base, subject.fresh(*block[1]))[0].sum()) for block in blocks)
     found = Found(base, order, elpd, k, lppd, error, refits=len(blocks))
     _note(found, subject)
-    found.left = int((k > arviz_bridge.good_k(len(base.log_weights))).sum())
+    found.left = int((k > good_k(len(base.log_weights))).sum())
     return found
 
 

@@ -15,6 +15,7 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.records import as_records
 from pyro_dynogp.inference.fitted import Fitted, known_fit
 from pyro_dynogp.inference.isolation import isolated
+from pyro_dynogp.inference.pareto import good_k
 from pyro_dynogp.support.errors import invalid
 
 Target = Literal["missing sample", "forecast", "new record"]
@@ -56,8 +57,8 @@ def loo(
         begin: of "forecast": first sample that is scored, a number of samples or a share of the
             record.
         folds: of "new record", contiguous blocks of a single record.
-        draws: of the posterior (of NUTS all). They are kept with the fit: a second call, another
-            target and `check` take the same ones.
+        draws: of the posterior; of fits by importance or NUTS those that the fit holds, which
+            `check` and every target take.
         parameters: "posterior", or "mode" for densities with all parameters at the mode, which has
             seen the data: O(n) and quick, and kind to models of many parameters. For records so
             long that parameters are all but known.
@@ -133,7 +134,7 @@ def _elpd(subject: Subject, found: Found, target: str, horizon: int) -> Any:
     count = len(subject.draws)
     if found.left:
         found.notes.append(
-            f"{found.left} samples have a Pareto k above {arviz_bridge.good_k(count):.2f} and were "
+            f"{found.left} samples have a Pareto k above {good_k(count):.2f} and were "
             "not fitted again: raise `refits`, or use target='new record'."
         )
     order = np.argsort(found.index)

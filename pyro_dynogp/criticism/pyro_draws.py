@@ -10,7 +10,7 @@ import pyro
 import torch
 from torch import Tensor
 
-from pyro_dynogp.criticism.posterior_draws import PosteriorDraws
+from pyro_dynogp.inference.posterior_draws import PosteriorDraws
 from pyro_dynogp.inference.posteriors import Mixture, Sampled
 from pyro_dynogp.layers.sites import Arguments, Program
 from pyro_dynogp.support.errors import invalid

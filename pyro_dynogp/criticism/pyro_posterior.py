@@ -16,7 +16,6 @@ from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.densities import Kind
 from pyro_dynogp.criticism.inference_data import NOT_FOR_LOO, pareto_attrs
 from pyro_dynogp.criticism.labelled import Coordinate, Variable, dataset_of
-from pyro_dynogp.criticism.posterior_draws import PosteriorDraws
 from pyro_dynogp.criticism.site_densities import (
     elementwise_density,
     integrated_density,
@@ -25,6 +24,7 @@ from pyro_dynogp.criticism.site_densities import (
 )
 from pyro_dynogp.criticism.site_dimensions import dimensions_for
 from pyro_dynogp.criticism.subjects import Subject, fingerprint_of, no_refit
+from pyro_dynogp.inference.posterior_draws import PosteriorDraws
 from pyro_dynogp.support.errors import invalid, verify
 from pyro_dynogp.support.parallel import seeded
 from pyro_dynogp.support.version import __version__

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 import pyro
 import torch
 from torch import Tensor
 
-from pyro_dynogp.criticism.posterior_draws import draws_of, log_joint
+from pyro_dynogp.criticism.posterior_draws import equal_draws, log_joint
 from pyro_dynogp.criticism.rank_results import SimulationBasedCalibration, judged
 from pyro_dynogp.criticism.ranks import rank_of
 from pyro_dynogp.data.record import Record
@@ -19,6 +19,7 @@ from pyro_dynogp.data.records import one_record
 from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.inference.methods.base import Method, Problem
 from pyro_dynogp.inference.methods.choose import method_of
+from pyro_dynogp.inference.posteriors import MethodName
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.training import train_model
 from pyro_dynogp.models.model import Model
@@ -66,7 +67,7 @@ def simulation_based_calibration(
     model: Model,
     record: Record,
     *,
-    method: Literal["map", "svi", "nuts"] = "svi",
+    method: MethodName = "svi",
     replicates: int = 50,
     draws: int = 99,
     level: float = 0.95,
@@ -166,8 +167,8 @@ def _check(
             "model", expected="priors that can be drawn from", got="priors='paper', which are flat"
         )
     one_record(record, "Calibrate one after the other.")
-    if method not in ("map", "svi", "nuts"):
-        raise invalid("method", expected="'map', 'svi' or 'nuts'", got=repr(method))
+    if method not in get_args(MethodName):
+        raise invalid("method", expected=f"one of {list(get_args(MethodName))}", got=repr(method))
     for name, value, least in (("replicates", replicates, 2), ("draws", draws, 9)):
         if not isinstance(value, int) or isinstance(value, bool) or value < least:
             raise invalid(name, expected=f"a whole number >= {least}", got=repr(value))
@@ -206,7 +207,7 @@ def _simulated(task: _Task) -> tuple[dict[str, Tensor], Record]:
 
 
 def _method(
-    model: Model, name: Literal["map", "svi", "nuts"], draws: int, options: Mapping[str, Any]
+    model: Model, name: MethodName, draws: int, options: Mapping[str, Any]
 ) -> tuple[Method, Run, Mapping[str, Tensor] | None]:
     """The method that gives so many draws, what its runs share, and values that it starts from."""
     loose = dict(options)
@@ -214,7 +215,7 @@ def _method(
     start = loose.pop("start", None)
     if name == "nuts":
         loose["draws"] = -(-THIN * draws // loose.get("chains", 4))
-    elif name == "svi":
+    elif name in ("svi", "importance"):
         loose["draws"] = draws
     chosen = method_of(name, model, loose)
     chosen.check(model, warm=start is not None)
@@ -228,7 +229,7 @@ def _fitted(task: _Task, record: Record) -> Fitted:
 
 def _ranked(task: _Task, truth: Mapping[str, Tensor], fitted: Fitted) -> _Outcome:
     generator = np.random.default_rng(task.run.seed)
-    own = draws_of(fitted, count=task.draws, seed=task.run.seed, anneal=False)
+    own = equal_draws(fitted, count=task.draws, seed=task.run.seed)
     known = {name: truth[name].unsqueeze(0) for name in own.values}
     log_p = log_joint(fitted, own.values) if own.log_p is None else own.log_p
     kept = np.linspace(0, len(own) - 1, task.draws).round().astype(int)

@@ -12,14 +12,10 @@ import numpy as np
 import torch
 
 from pyro_dynogp.criticism.densities import Kind, pointwise_log_density
-from pyro_dynogp.criticism.posterior_draws import (
-    AT_ONCE,
-    PosteriorDraws,
-    Values,
-    carried,
-    draws_of,
-)
+from pyro_dynogp.criticism.posterior_draws import carried, draws_of
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.inference.log_joint import AT_ONCE
+from pyro_dynogp.inference.posterior_draws import PosteriorDraws, Values
 from pyro_dynogp.inference.refit import refit
 from pyro_dynogp.models.output_process import OutputProcess
 from pyro_dynogp.models.outputs import output_process
@@ -78,9 +74,9 @@ class FitSubject:
     progress: bool = False
     drawn: PosteriorDraws | None = None
 
-    @property
+    @cached_property
     def draws(self) -> PosteriorDraws:
-        """Draws (S) of the posterior, kept with the fit, or the mode as the only one."""
+        """Draws (S) of the posterior, or the mode as the only one."""
         if self.drawn is not None:
             return self.drawn
         if self.parameters == "mode":
@@ -134,7 +130,7 @@ class FitSubject:
     def carries(self) -> bool:
         """Whether draws can be moved to other data without a fit, as `carried` does."""
         known = self.parameters == "mode" or self.fit.model.has_function
-        return self.fit.method == "map" and not known
+        return self.fit.method in ("map", "importance") and not known
 
     def carried(self, left_out: np.ndarray) -> FitSubject:
         """As `without`, by these draws moved to the posterior given those data."""

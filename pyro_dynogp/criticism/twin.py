@@ -12,7 +12,7 @@ from pyro.ops.stats import split_gelman_rubin
 from torch import Tensor
 
 from pyro_dynogp.criticism.finding import Finding, apart
-from pyro_dynogp.criticism.posterior_draws import draws_of, log_joint
+from pyro_dynogp.criticism.posterior_draws import equal_draws, log_joint
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.methods.nuts import Chains, sample_posterior
@@ -94,12 +94,12 @@ def twin_findings(
     )
     drawn = {name: x.flatten(0, 1) for name, x in chains.draws.items()}
     settled = _settled(small, drawn, effort)
-    own = draws_of(small, seed=seed, anneal=False)
+    own = equal_draws(small, seed=seed)
     potential = Potential(target, (records,), values)
     sites, left = _sites(potential, own.values, chains)
     predictions = _predictions(small, drawn)
     known = bool(settled <= UNSETTLED)
-    whose = own.kind if fit.method == "svi" else f"{own.kind} (predictions: the mode)"
+    whose = f"{own.kind} (predictions: the mode)" if fit.method == "map" else own.kind
     about = (
         f"{whose} against {effort.chains} x {effort.draws} draws of NUTS, on the first samples; "
         f"R-hat of NUTS's log density {settled:.2f}"

@@ -175,6 +175,10 @@ class Scaling:
         return hash((self.time_step, self.duration, self.input_names, self.output_names))
 
 
+# Samples below which a record is short: it may show a part of what the system does.
+SHORT = 100.0
+
+
 @dataclass(frozen=True)
 class TimeScale:
     """What the record says about time constants.
@@ -199,6 +203,15 @@ class TimeScale:
     def rate_bounds(self) -> tuple[float, float]:
         """Logarithms of the slowest and fastest rates [1/s] that the record can show."""
         return math.log(1.0 / self.duration), math.log(math.pi / self.step)
+
+    @property
+    def brevity(self) -> float:
+        """How much wider a short record has priors of slow poles, gains and offset; 1 for others.
+
+        With few samples a system may well be slower than the record is long, and its outputs go far
+        beyond those measured. `SHORT` over the number of steps, and at least one.
+        """
+        return max(1.0, SHORT * self.step / self.duration)
 
     @property
     def typical_rate(self) -> float:

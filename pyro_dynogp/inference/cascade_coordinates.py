@@ -75,6 +75,11 @@ class StraightPotential(Potential):
         """Coordinates (*s, d) to constrained values (*s, *shape) of every site."""
         return super().unpack(self._unconstrained(x)[0])
 
+    def log_jacobian(self, z: Tensor) -> Tensor:
+        """Log |d values / dz| (*s) at coordinates z (*s, d)."""
+        plain, log_det = self._unconstrained(z)
+        return super().log_jacobian(plain) + log_det
+
     def energy(self, z: Tensor, *, jacobian: bool) -> Tensor:
         """-log density at z (d,): of the values, or with `jacobian` of the coordinates."""
         plain, log_det = self._unconstrained(z)

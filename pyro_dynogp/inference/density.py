@@ -168,6 +168,14 @@ class Potential:
         """
         return joint_energy(self.log_density, self.sites, z, jacobian=jacobian)
 
+    def log_jacobian(self, z: Tensor) -> Tensor:
+        """Log |d values / dz| (*s) at unconstrained vectors z (*s, d)."""
+        total = torch.zeros(z.shape[:-1], dtype=torch.float64)
+        for site, part in parts(self.sites, z):
+            each = site.transform.log_abs_det_jacobian(part, site.transform(part))
+            total = total + each.reshape(*z.shape[:-1], -1).sum(-1)
+        return total
+
     def value_and_gradient(
         self, z: np.ndarray, *, jacobian: bool = False
     ) -> tuple[float, np.ndarray]:
@@ -222,15 +230,18 @@ class Potential:
         curvature = np.maximum(np.linalg.eigvalsh(self.hessian(z, step=1e-3)), WIDEST**-2)
         return float(-energy - 0.5 * np.log(curvature / (2.0 * math.pi)).sum())
 
-    def laplace(self, values: Mapping[str, Tensor]) -> tuple[np.ndarray, np.ndarray]:
+    def laplace(
+        self, values: Mapping[str, Tensor], steps: int = LAPLACE_STEPS
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Centre (d,) and root (d, d) of the Laplace approximation of the unconstrained vector.
 
         The centre is the mode of that vector's own density (with Jacobian), climbed to from
-        `values`: the mode of the constrained density can lie on a boundary, at minus infinity.
+        `values` in so many iterations at most: the mode of the constrained density can lie on a
+        boundary, at minus infinity.
         """
         every = self.hessian_cost
         z, _, _ = descend(
-            self.with_jacobian, self.pack(values).numpy(), LAPLACE_STEPS, every=every, first=0
+            self.with_jacobian, self.pack(values).numpy(), steps, every=every, first=0
         )
         return z, bounded_root(self.hessian(z))
 

@@ -43,12 +43,12 @@ class Fitted:
 
     Attributes:
         model: the model with the scaling of its training record.
-        posterior: a `Mixture` (a mode, or what SVI fits), or `Sampled` (NUTS, and SVI with
-            trajectories as sites).
+        posterior: a `Mixture` (a mode, or what SVI fits), or `Sampled` (draws by importance, NUTS,
+            and SVI with trajectories as sites).
         draws: (S, *shape) posterior draws of every latent site; S = 1 for a mode.
         mode: values of every latent site at the best optimum found.
-        history: objective after each iteration: -log p(y, values) for "map" and "nuts" (of the
-            best start), the ELBO for "svi" [nats].
+        history: objective after each iteration: the ELBO for "svi", for others -log p(y, values) of
+            the best start [nats].
         start_energies: -log p(y, values) that each start came to (-ELBO where trajectories are
             sites), best first.
         diagnostics: what the method says about itself, numbers by name.
@@ -77,7 +77,7 @@ class Fitted:
 
     @property
     def method(self) -> MethodName:
-        """The short name of the method: "map", "svi" or "nuts"."""
+        """The short name of the method: "importance", "map", "svi" or "nuts"."""
         return self.posterior.method
 
     @property
@@ -147,7 +147,7 @@ class Fitted:
 
     @property
     def elbo(self) -> np.ndarray:
-        """Evidence lower bound after each step of SVI; for "map" log p(y, values) [nats].
+        """Evidence lower bound after each step of SVI; for others log p(y, values) [nats].
 
         One value where Laplace's approximation was so close that SVI did not start.
         """

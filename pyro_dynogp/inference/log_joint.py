@@ -10,12 +10,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Protocol
 
+import numpy as np
 import pyro
 import torch
 from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal
 
 from pyro_dynogp.layers.sites import Arguments, Program, Site, Values
+from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
 from pyro_dynogp.models.limits import at_limits, log_probability_scale
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.output_process import OutputProcess
@@ -23,6 +25,8 @@ from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.prepared import PreparedRecord, Records
 from pyro_dynogp.support.errors import invalid
 
+# Samples times draws that are evaluated at once.
+AT_ONCE = 4_000_000
 # Name of a latent site, its prior, its value without gradient.
 Latent = tuple[str, Distribution, Tensor]
 
@@ -178,3 +182,43 @@ def density_of(model: Program, args: Arguments) -> Direct | Traced:
         if all(record.n_outputs for record in measured):
             return Direct(model, records)
     return Traced(model, args)
+
+
+def log_joint_of(
+    model: Program, args: Arguments, values: Values, samples: int = 1000
+) -> np.ndarray:
+    """Log-density (S,) of a Pyro model at S draws of its latent sites, those of the data included.
+
+    Draws go through the model together where it broadcasts, in portions of bounded memory.
+    """
+    count = len(next(iter(values.values())))
+    portion = max(1, AT_ONCE // max(samples, 1))
+    parts = []
+    for first in range(0, count, portion):
+        some = {name: x[first : first + portion] for name, x in values.items()}
+        parts.append(_portion(model, args, some))
+    return np.concatenate(parts)
+
+
+def _portion(model: Program, args: Arguments, values: Values) -> np.ndarray:
+    count = len(next(iter(values.values())))
+    try:
+        with torch.no_grad(), pyro.validation_enabled(False):
+            trace = Traced(model, args).trace(values)
+            trace.compute_log_prob()
+    except (NotPositiveDefiniteError, torch.linalg.LinAlgError, ValueError) as error:
+        # Pyro wraps what a distribution raises in a ValueError.
+        singular = (NotPositiveDefiniteError, torch.linalg.LinAlgError)
+        if not isinstance(error, singular) and not isinstance(error.__cause__, singular):
+            raise
+        if count == 1:  # this draw: the density cannot be evaluated there
+            return np.array([-np.inf])
+        each = [_portion(model, args, {k: v[i : i + 1] for k, v in values.items()}) for i in
+                range(count)]  # fmt: skip
+        return np.concatenate(each)
+    for name, node in trace.nodes.items():
+        latent = node["type"] == "sample" and not node["is_observed"] and name not in values
+        if latent and type(node["fn"]).__name__ != "_Subsample":
+            raise invalid("values", expected=f"draws of every site, {name!r} too", got="none of it")
+    total = log_prob_by_draw(trace, count).numpy()
+    return np.where(np.isfinite(total), total, -np.inf)

@@ -12,11 +12,12 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.inference.density import Potential, Site, parts
+from pyro_dynogp.inference.posterior_draws import PosteriorDraws
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import seeded
 
-MethodName = Literal["map", "svi", "nuts"]
+MethodName = Literal["importance", "map", "svi", "nuts"]
 Guide = Callable[..., dict[str, Tensor]]
 
 
@@ -196,7 +197,7 @@ class Mixture:
 
 @dataclass(frozen=True, eq=False)
 class Sampled:
-    """Draws of a posterior: of chains, or of a guide that has trajectories as sites.
+    """Draws of a posterior: of chains, by importance, or of a guide with trajectories as sites.
 
     As a guide it samples the number of a draw (auxiliary site ``_draw``), then every site at it.
 
@@ -207,16 +208,20 @@ class Sampled:
             where the guide had them.
         log_q_sites: (S,) log-density of the draws of each site, auxiliary ones of the guide too,
             where the guide had trajectories as sites [nats].
+        source: the draws with their densities that `values` were resampled from, where they were.
     """
 
     values: Mapping[str, Tensor]
     method: MethodName = "nuts"
     trajectories: Mapping[str, Tensor] = field(default_factory=lambda: FrozenMapping({}))
     log_q_sites: Mapping[str, Tensor] = field(default_factory=lambda: FrozenMapping({}))
+    source: PosteriorDraws | None = None
 
     @property
     def kind(self) -> str:
         """In words."""
+        if self.source is not None:
+            return self.source.kind
         return "SVI with trajectories as sites" if self.log_q_sites else self.method.upper()
 
     def __call__(self, *args: object) -> dict[str, Tensor]:
@@ -244,7 +249,7 @@ class Sampled:
 
     def with_values(self, values: Mapping[str, Tensor]) -> Sampled:
         """Other draws; that trajectories were sites stays known."""
-        return replace(self, values=values, trajectories=FrozenMapping({}))
+        return replace(self, values=values, trajectories=FrozenMapping({}), source=None)
 
 
 Posterior = Mixture | Sampled

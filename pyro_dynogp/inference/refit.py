@@ -13,6 +13,7 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.methods.base import Problem
+from pyro_dynogp.inference.methods.importance import with_draws_around
 from pyro_dynogp.inference.methods.mode import at_optimum, climb, louder
 from pyro_dynogp.inference.methods.nuts import sample_posterior
 from pyro_dynogp.inference.methods.optima import POLISH, Hyperparameters, posterior_of
@@ -210,6 +211,8 @@ def _posterior(
     if fit.method == "map":
         return mode
     count = len(next(iter(fit.draws.values())))
+    if fit.method == "importance":
+        return type(fit).of(with_draws_around(problem, list(optima), run, count))
     if fit.method == "nuts":
         chains = int(fit.diagnostics["chains"])
         found = sample_posterior(

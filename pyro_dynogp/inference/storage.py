@@ -21,6 +21,7 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.density import Site
 from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.posterior_draws import PosteriorDraws
 from pyro_dynogp.inference.posteriors import Mixture, Posterior, Sampled
 from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.layers.sites import Values
@@ -37,6 +38,8 @@ VERSION, OLDEST = 6, 4
 UNMARKED = 5
 # The models that a file may name: a file never decides what code is run.
 MODELS = ("Model", "Cascade", "LinearDynamicGP")
+# Arrays of draws with densities, where there are such.
+SOURCE = ("log_p", "log_q", "ancestor")
 LAYERS: dict[str, type[Dynamic] | type[Static]] = {"Dynamic": Dynamic, "Static": Static}
 
 
@@ -58,6 +61,14 @@ def save(fit: Fitted, path: str | Path) -> None:
         tensors["posterior/loc"] = posterior.loc
         tensors["posterior/scale_tril"] = posterior.scale_tril
         tensors |= {f"point/{name}": value for name, value in posterior.points.items()}
+    source = posterior.source if isinstance(posterior, Sampled) else None
+    if source is not None:
+        tensors |= {f"source/{name}": value for name, value in source.values.items()}
+        tensors |= {
+            f"source_{name}": torch.as_tensor(np.ascontiguousarray(x))
+            for name in SOURCE
+            if (x := getattr(source, name)) is not None
+        }
     for index, record in enumerate(fit.records):
         tensors |= _arrays(record, f"record/{index}")
     tensors |= {f"log_q/{name}": value for name, value in fit.log_q_sites.items()}
@@ -74,6 +85,7 @@ def save(fit: Fitted, path: str | Path) -> None:
         "diagnostics": dict(fit.diagnostics),
         "sites": list(fit.draws),
         "points": points,
+        "source": None if source is None else source.kind,
     }
     path = Path(path)
     try:
@@ -244,7 +256,8 @@ def _restore(header: dict[str, Any], tensors: dict[str, Any]) -> Fitted:
     elif header["method"] == "map":
         posterior = Mixture.at(mode)
     else:
-        posterior = Sampled(draws, header["method"], log_q_sites=log_q)
+        source = _source(header, tensors)
+        posterior = Sampled(draws, header["method"], log_q_sites=log_q, source=source)
     return Fitted(
         model=model,
         posterior=posterior,
@@ -259,6 +272,18 @@ def _restore(header: dict[str, Any], tensors: dict[str, Any]) -> Fitted:
             for index, labels in enumerate(header["records"])
         ),
     )
+
+
+def _source(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> PosteriorDraws | None:
+    """The draws with densities behind those of a fit, where the file has them."""
+    if header.get("source") is None:
+        return None
+    values = FrozenMapping({site: tensors[f"source/{site}"] for site in header["sites"]})
+    log_p, log_q, ancestor = (
+        tensors[key].numpy() if (key := f"source_{name}") in tensors else None for name in SOURCE
+    )
+    group = np.zeros(len(next(iter(values.values()))), dtype=int)
+    return PosteriorDraws(values, log_p, log_q, group, header["source"], ancestor)
 
 
 def _arrays(record: Record, key: str) -> dict[str, Tensor]:

@@ -20,6 +20,7 @@ def summary(fit: Fitted) -> str:
     lines[0] += f"; method {fit.method!r}, seed {fit.seed}"
     energies = ", ".join(f"{e:.1f}" for e in fit.start_energies[:6])
     lines.append(f"-log p(y, values) of the starts: {energies}")
+    lines.append(_posterior(fit))
     unit = fit.scaling.time_unit
     for wire, layer in system.dynamic:
         if len(model.wires) > 1:
@@ -35,6 +36,18 @@ def summary(fit: Fitted) -> str:
         lines.append(f"measurement noise sd: {sd}")
     lines.extend(f"warning: {sentence}" for sentence in warnings_of(fit))
     return "\n".join(lines)
+
+
+def _posterior(fit: Fitted) -> str:
+    """What the draws are."""
+    if fit.method == "map":
+        return "parameters at the mode: bands leave out their uncertainty (the default counts it)"
+    count = len(next(iter(fit.draws.values())))
+    line = f"{count} draws: {fit.posterior.kind}"
+    if "independent draws" in fit.diagnostics:
+        k, number = fit.diagnostics["pareto_k"], fit.diagnostics["independent draws"]
+        line += f"; Pareto k {k:.2f} of the proposal, {number:.0f} effective draws"
+    return line
 
 
 def _describe(layer: Layer) -> str:

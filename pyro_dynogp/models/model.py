@@ -102,7 +102,7 @@ class Model(Structure):
             yield direct_site(self.direct, self.outputs, flat=flat)
         if self.measured_signal is not None:
             zero = torch.zeros(self.outputs, dtype=torch.float64)
-            prior = dist.Normal(zero, zero + (FLAT if flat else 1.0)).to_event(1)
+            prior = dist.Normal(zero, zero + (FLAT if flat else time_scale.brevity)).to_event(1)
             yield Site("offset", prior, ("output",))
         yield from self.likelihood.sites(self.outputs, self.inputs - self.direct, flat=flat)
 

@@ -152,13 +152,13 @@ class ModesPrior:
             return tuple(dims.get(dim, dim) for dim in generic)
 
         name, P, n_u = self.name, self.pairs, self.inputs
-        flat = self.priors == "paper"
+        flat, wide = self.priors == "paper", self.time_scale.brevity
         sites = [*self._pole_sites(named("pair"))]
         if n_u:
             gain = (
                 _normal(FLAT, P, n_u, 2)
                 if flat
-                else SharedScaleNormal(GAIN_FREEDOM, self.gain_scale, (P, n_u, 2), apart=1)
+                else SharedScaleNormal(GAIN_FREEDOM, wide * self.gain_scale, (P, n_u, 2), apart=1)
             )
             over = named("pair", "input", "term")
             sites.append(Site(f"{name}_input_gain", gain, over, growth=0.0))
@@ -201,7 +201,7 @@ class ModesPrior:
         else:
             half = 0.5 * (high - low)
             top = torch.full((self.pairs,), half, dtype=torch.float64)
-            settling = torch.full_like(top, SETTLING / math.exp(half))
+            settling = torch.full_like(top, SETTLING / self.time_scale.brevity / math.exp(half))
             decay = LogDecayRate(settling, top).to_event(1)
             bottom = torch.full_like(top, -half - math.log(10.0))
             frequency = dist.Uniform(bottom, top).to_event(1)

@@ -16,7 +16,6 @@ from scipy.stats import norm
 from tqdm import tqdm
 
 import pyro_dynogp as dgp
-from pyro_dynogp.criticism import arviz_bridge
 from pyro_dynogp.criticism.left_out import monte_carlo_error
 from pyro_dynogp.criticism.posterior_draws import draws_of
 from pyro_dynogp.criticism.subjects import FitSubject, observed_of
@@ -24,6 +23,7 @@ from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.optima import posterior_of
 from pyro_dynogp.inference.methods.svi import Schedule
 from pyro_dynogp.inference.optimise.maximum import Optimum
+from pyro_dynogp.inference.pareto import good_k, psis
 from pyro_dynogp.inference.refit import optima_of, refit
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.models.architectures import Cascade
@@ -100,8 +100,8 @@ def at_the_optimum(fit: Any, record: dgp.Record) -> Any:
 def density_of(again: Any, whole: dgp.Record, i: int, kind: Any) -> tuple[float, float]:
     """Log-density of sample i of the whole record under a fit without it, and its error."""
     subject = FitSubject(again, (whole,), BRUTE_DRAWS, BRUTE_SEED)
-    log_weights, k = arviz_bridge.psis(subject.draws.log_ratio)
-    if k > arviz_bridge.good_k(BRUTE_DRAWS):  # as the hook does: draws as they are
+    log_weights, k = psis(subject.draws.log_ratio)
+    if k > good_k(BRUTE_DRAWS):  # as the hook does: draws as they are
         log_weights = np.full(len(log_weights), -np.log(len(log_weights)))
     density = subject.pointwise(kind)[:, [i]]
     found = logsumexp(log_weights + density[:, 0])
@@ -150,7 +150,7 @@ def conditional(fit: Any, record: dgp.Record) -> np.ndarray:
         seen = (seen - observed.shift.item()) / scale
     z = mean + np.sqrt(variance) * np.random.default_rng(4).standard_normal(mean.shape)
     density = norm.logpdf(seen, z, np.sqrt(noise)) - np.log(scale)
-    log_weights = arviz_bridge.psis(-density.T)[0]
+    log_weights = psis(-density.T)[0]
     return logsumexp(log_weights + density.T, axis=1)
 
 

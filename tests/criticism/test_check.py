@@ -8,8 +8,8 @@ import pytest
 import torch
 
 import pyro_dynogp as dgp
-from pyro_dynogp.criticism.arviz_bridge import good_k
 from pyro_dynogp.criticism.finding import Finding, apart
+from pyro_dynogp.inference.pareto import good_k
 from pyro_dynogp.inference.posteriors import Sampled
 from tests.conftest import simulate_record
 
@@ -61,16 +61,12 @@ def test_numbers_near_their_limit_are_told_apart():
 
 def test_k_at_its_limit_is_printed_so_that_it_is_understood(good, monkeypatch):
     limit = good_k(1000)
-    monkeypatch.setattr(
-        "pyro_dynogp.criticism.check.arviz_bridge.psis", lambda ratio: (None, limit + 4e-4)
-    )
+    monkeypatch.setattr("pyro_dynogp.criticism.check.psis", lambda ratio: (None, limit + 4e-4))
     found = dgp.check(good)["posterior k"]
     assert found.good is False
     assert found.number == "0.6671"
     assert "k = 0.6671 (good: up to 0.6667)" in found.text
-    monkeypatch.setattr(
-        "pyro_dynogp.criticism.check.arviz_bridge.psis", lambda ratio: (None, limit - 4e-4)
-    )
+    monkeypatch.setattr("pyro_dynogp.criticism.check.psis", lambda ratio: (None, limit - 4e-4))
     assert dgp.check(good)["posterior k"].good
 
 

@@ -112,9 +112,13 @@ def test_the_right_number_of_pairs_and_process_noise(one_pair):
     """Process noise that the data have is preferred to none, by fits of the package itself."""
     record = simulate_record(one_pair, 0.05, n=80, seed=1)
     fits = {
-        "with": dgp.fit(dgp.LinearDynamicGP(1, pairs=1), record, restarts=2, **QUIET),
+        "with": dgp.fit(dgp.LinearDynamicGP(1, pairs=1), record, restarts=2, **QUIET, method="map"),
         "without": dgp.fit(
-            dgp.LinearDynamicGP(1, pairs=1, process_noise=False), record, restarts=2, **QUIET
+            dgp.LinearDynamicGP(1, pairs=1, process_noise=False),
+            record,
+            restarts=2,
+            **QUIET,
+            method="map",
         ),
     }
     found = dgp.compare(fits, target="missing sample", draws=100, refits=0, **QUIET)

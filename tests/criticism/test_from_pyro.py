@@ -16,8 +16,8 @@ from scipy.stats import norm
 import pyro_dynogp as dgp
 from pyro_dynogp.criticism.densities import pointwise_log_density
 from pyro_dynogp.criticism.from_pyro import from_pyro
-from pyro_dynogp.criticism.posterior_draws import log_joint_of
 from pyro_dynogp.distributions.process import ObservedLTIProcess
+from pyro_dynogp.inference.log_joint import log_joint_of
 from tests.distributions import models
 
 U, Y = models.inputs(), models.data()

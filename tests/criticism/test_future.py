@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pyro_dynogp.criticism.left_out import forecast
-from pyro_dynogp.criticism.posterior_draws import PosteriorDraws
+from pyro_dynogp.inference.posterior_draws import PosteriorDraws
 
 N, DRAWS = 24, 40
 

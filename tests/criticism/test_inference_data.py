@@ -185,7 +185,7 @@ class TestPrior:
 
     def test_of_flat_priors_is_left_out(self, record):
         model = dgp.LinearDynamicGP(inputs=1, pairs=1, priors="paper")
-        data = dgp.fit(model, record[:100], steps=60, **QUICK).to_arviz(samples=2)
+        data = dgp.fit(model, record[:100], steps=60, **QUICK, method="map").to_arviz(samples=2)
         assert "prior" not in data.groups()
         assert "flat" in data.posterior.attrs["prior"]
 
@@ -243,7 +243,7 @@ def test_two_outputs(two_output_fit):
 
 def test_two_records(record, tmp_path):
     model = dgp.LinearDynamicGP(inputs=1, pairs=1, initial_state="site")
-    fit = dgp.fit(model, [record[:90], record[90:150]], steps=60, **QUICK)
+    fit = dgp.fit(model, [record[:90], record[90:150]], steps=60, **QUICK, method="map")
     data = fit.to_arviz(future=record[150:170], **FEW)
     assert data.observed_data["y_0"].dims == ("time_0", "output")
     assert data.observed_data.sizes["time_1"] == 60
@@ -332,7 +332,7 @@ class TestDatasets:
 def test_units_of_time_are_not_taken_for_time_spans(record, unit, tmp_path):
     """CF conventions read some units of time as spans: numbers have to come back as numbers."""
     own = dgp.Record(record.time[:60], record.inputs[:60], record.outputs[:60], time_unit=unit)
-    fit = dgp.fit(dgp.LinearDynamicGP(inputs=1, pairs=1), own, steps=30, **QUICK)
+    fit = dgp.fit(dgp.LinearDynamicGP(inputs=1, pairs=1), own, steps=30, **QUICK, method="map")
     data = fit.to_arviz(samples=2, prior_samples=0)
     path = str(tmp_path / "units.nc")
     data.to_netcdf(path)

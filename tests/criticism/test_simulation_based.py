@@ -8,9 +8,9 @@ import torch
 
 import pyro_dynogp as dgp
 from pyro_dynogp.criticism import simulation_based
-from pyro_dynogp.criticism.posterior_draws import PosteriorDraws
 from pyro_dynogp.criticism.simulation_based import _method, _simulated, _Task
 from pyro_dynogp.fitting import Fit
+from pyro_dynogp.inference.posterior_draws import PosteriorDraws
 from pyro_dynogp.inference.posteriors import Sampled
 
 QUIET = {"workers": 1, "progress": False}
@@ -96,13 +96,15 @@ def test_an_overconfident_posterior_is_rejected(model, blank, monkeypatch, width
     def nothing(task, record):
         return Fit(task.model, Sampled({}), {}, {}, np.zeros(1), np.zeros(1), {}, 0, ())
 
-    def draws_of(fit, *, count, seed, anneal):
+    wide = dgp.TimeScale.of(model.scaling).brevity
+
+    def equal_draws(fit, *, count, seed):
         generator = torch.Generator().manual_seed(seed)
-        offset = width * torch.randn(count, 1, generator=generator, dtype=torch.float64)
+        offset = width * wide * torch.randn(count, 1, generator=generator, dtype=torch.float64)
         return PosteriorDraws({"offset": offset}, np.zeros(count), None, np.zeros(count, int), "")
 
     monkeypatch.setattr(simulation_based, "_fitted", nothing)
-    monkeypatch.setattr(simulation_based, "draws_of", draws_of)
+    monkeypatch.setattr(simulation_based, "equal_draws", equal_draws)
     monkeypatch.setattr(simulation_based, "log_joint", lambda fit, values: np.zeros(1))
     found = run(model, blank, replicates=60)
     assert found.calibrated == right
@@ -123,7 +125,7 @@ def test_outputs_of_a_cascade_come_from_its_trajectories(blank):
 
 def test_what_is_refused(model, blank):
     for change, words in (
-        ({"method": "laplace"}, "method: expected 'map', 'svi' or 'nuts'"),
+        ({"method": "laplace"}, "method: expected one of \\['importance', 'map', 'svi', 'nuts'\\]"),
         ({"replicates": 1}, "replicates: expected a whole number >= 2"),
         ({"draws": 5}, "draws: expected a whole number >= 9"),
         ({"level": 1.0}, "level: expected a probability"),

@@ -8,11 +8,12 @@ import pytest
 import torch
 
 import pyro_dynogp as dgp
-from pyro_dynogp.criticism import arviz_bridge, twin
-from pyro_dynogp.criticism.posterior_draws import log_joint_of
+from pyro_dynogp.criticism import twin
 from pyro_dynogp.criticism.twin import Effort, Gap, _judged, _rms, _sites, twin_findings
 from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.log_joint import log_joint_of
 from pyro_dynogp.inference.methods.nuts import Chains
+from pyro_dynogp.inference.pareto import psis
 from pyro_dynogp.inference.posteriors import Mixture, Sampled
 from pyro_dynogp.inference.refit import refit
 from tests.conftest import simulate_record
@@ -31,7 +32,7 @@ def exact(model, argument, values, *, chains, draws, **options):
     z = torch.randn(4000, len(centre), generator=generator, dtype=torch.float64)
     found = guide.at_latent(guide.loc[0] + z @ guide.scale_tril[0].mT)
     ratio = log_joint_of(model, (argument,), found) - guide.log_prob(found).numpy()
-    weights = np.exp(arviz_bridge.psis(ratio)[0])
+    weights = np.exp(psis(ratio)[0])
     chosen = np.random.default_rng(0).choice(4000, chains * draws, p=weights / weights.sum())
     drawn = {name: x[chosen].reshape(chains, draws, *x.shape[1:]) for name, x in found.items()}
     return Chains(drawn, {}, {}, 0)
@@ -120,7 +121,7 @@ def test_with_nuts_itself(one_pair):
     """Several records, by a mode: the first share of each; too few draws to judge by."""
     records = [simulate_record(one_pair, 0.1, n=n, seed=n) for n in (20, 40)]
     model = dgp.LinearDynamicGP(inputs=1, pairs=1, process_noise=False)
-    fit = dgp.fit(model, records, restarts=1, steps=20, **QUIET)
+    fit = dgp.fit(model, records, restarts=1, steps=20, **QUIET, method="map")
     found = twin_findings(fit, 24, effort=Effort(2, 4, 2), workers=1)
     assert found[0].text.startswith("Laplace's approximation (predictions: the mode) against 2 x 4")
     assert "root mean square over 24" in found[-1].text

@@ -41,7 +41,7 @@ def machine(seed: int = 0, weight: float = 0.0, **options: Any) -> dgp.Record:
 
 def fitted(record: dgp.Record) -> dgp.Fit:
     model = dgp.LinearDynamicGP(inputs=1, pairs=1, process_noise=False)
-    return dgp.fit(model, record[:240], restarts=2, workers=1, progress=False)
+    return dgp.fit(model, record[:240], restarts=2, workers=1, progress=False, method="map")
 
 
 def close(fit: dgp.Fit, record: dgp.Record, **options: Any) -> Any:
@@ -160,7 +160,7 @@ def test_a_record_without_inputs() -> None:
     y[270:] += 4.0
     record = dgp.Record(0.1 * np.arange(N), outputs=y)
     model = dgp.LinearDynamicGP(inputs=0, pairs=1)
-    fit = dgp.fit(model, record[:240], restarts=2, workers=1, progress=False)
+    fit = dgp.fit(model, record[:240], restarts=2, workers=1, progress=False, method="map")
     looked_for = (effects.LevelShift(), effects.DeadTime(), effects.UnmodelledDynamics())
     report = close(fit, record, effects=looked_for)
     (found,) = report.effects

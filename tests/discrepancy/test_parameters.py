@@ -45,7 +45,7 @@ def record_of(seed, acting, **extra):
 
 
 def fitted(model, record):
-    return dgp.fit(model, record, restarts=2, workers=1, progress=False)
+    return dgp.fit(model, record, restarts=2, workers=1, progress=False, method="map")
 
 
 def late(u, delay):
@@ -202,7 +202,7 @@ def test_limits_of_a_sensor():
     clipped = np.clip(record.outputs[:, 0], -np.inf, 0.6)
     record = record.with_outputs(clipped + 0.02 * np.random.default_rng(1).standard_normal(N))
     model = dgp.Wiener(1, pairs=1, inducing=16, process_noise=False)
-    fit = dgp.fit(model, record, restarts=2, steps=150, workers=1, progress=False)
+    fit = dgp.fit(model, record, restarts=2, steps=150, workers=1, progress=False, method="map")
     nothing = np.inf
     found = Saturation().parameters(fit, evidence_of({"low": -nothing, "high": 0.61}), record)
     ((label, (mean, sd)),) = found.items()

@@ -97,7 +97,7 @@ def state():
     """A search on a small record in which nothing lacks."""
     record = machine(seed=2)
     model = dgp.LinearDynamicGP(1, pairs=1, process_noise=False)
-    fit = dgp.fit(model, record[:240], restarts=1, workers=1, progress=False)
+    fit = dgp.fit(model, record[:240], restarts=1, workers=1, progress=False, method="map")
     from pyro_dynogp.discrepancy.blocks import blocks_of
     from pyro_dynogp.discrepancy.context import Stopwatch
     from pyro_dynogp.inference.refit import refit
@@ -210,7 +210,7 @@ def test_two_outputs_go_through_the_loop():
     y[:, 1] += 0.4 * (time >= time[300])
     record = dgp.Record(time, u, y, output_names=("speed", "torque"))
     model = dgp.LinearDynamicGP(1, outputs=2, pairs=1, process_noise=False)
-    fit = dgp.fit(model, record[:240], restarts=1, workers=1, progress=False)
+    fit = dgp.fit(model, record[:240], restarts=1, workers=1, progress=False, method="map")
     report = dgp.close_loop(
         fit, record, effects=(effects.LevelShift(), effects.Drift()), max_rounds=1, workers=1,
         progress=False,
@@ -221,11 +221,15 @@ def test_two_outputs_go_through_the_loop():
     assert report.fit.model.outputs == 2
 
 
-@pytest.mark.parametrize("method", ["svi", "nuts"])
+@pytest.mark.parametrize("method", ["importance", "svi", "nuts"])
 def test_the_last_fits_have_the_kind_of_posterior_that_was_given(method):
     record = machine(seed=3, weight=0.3)
     model = dgp.LinearDynamicGP(1, pairs=1, process_noise=False)
-    options = {"svi": {"draws": 40, "steps": 60}, "nuts": {"draws": 6, "chains": 2, "warmup": 5}}
+    options = {
+        "importance": {"draws": 30},
+        "svi": {"draws": 40, "steps": 60},
+        "nuts": {"draws": 6, "chains": 2, "warmup": 5},
+    }
     fit = dgp.fit(
         model, record[:240], method=method, restarts=1, workers=1, progress=False,
         **options[method],

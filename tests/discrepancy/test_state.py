@@ -40,7 +40,7 @@ def oscillator(late: int, noise: float, seed: int) -> dgp.Record:
 @pytest.mark.parametrize(("late", "noise", "hides"), [(12, 0.0, True), (0, 0.5, False)])
 def test_process_noise_that_costs_forecasts_is_pointed_out(late, noise, hides):
     record = oscillator(late, noise, seed=1)
-    fit = dgp.fit(MODEL, record[:240], restarts=2, workers=1, progress=False)
+    fit = dgp.fit(MODEL, record[:240], restarts=2, workers=1, progress=False, method="map")
     data = blocks_of(fit, record, None, SETTINGS)
     training = without(data.known, data.held_out)
     rounds = SearchContext(data, [], 0, 0.05, 8, (effects.LevelShift(),), 1, False, SETTINGS)
@@ -52,7 +52,9 @@ def test_process_noise_that_costs_forecasts_is_pointed_out(late, noise, hides):
 
 def test_a_fit_without_process_noise_hides_nothing(rounds):
     model = without_process_noise(MODEL)
-    fit = dgp.fit(model, rounds.data.known[:240], restarts=1, workers=1, progress=False)
+    fit = dgp.fit(
+        model, rounds.data.known[:240], restarts=1, workers=1, progress=False, method="map"
+    )
     assert rounds.plain(fit) is fit
     assert rounds.hiding(fit, rounds.plain(fit)) == ""
 
@@ -60,7 +62,7 @@ def test_a_fit_without_process_noise_hides_nothing(rounds):
 @pytest.fixture(scope="module")
 def rounds():
     record = oscillator(0, 0.0, seed=2)
-    fit = dgp.fit(MODEL, record[:240], restarts=1, workers=1, progress=False)
+    fit = dgp.fit(MODEL, record[:240], restarts=1, workers=1, progress=False, method="map")
     return SearchContext(
         blocks_of(fit, record, None, SETTINGS), [], 0, 0.05, 8, (), 1, False, SETTINGS
     )
@@ -120,7 +122,9 @@ def test_noise_is_doubtful_where_a_cause_outside_the_catalogue_explains_far_more
 
 
 def test_the_omnibus_test_looks_at_all_that_is_known_without_process_noise(rounds):
-    fit = dgp.fit(MODEL, rounds.data.known[:240], restarts=1, workers=1, progress=False)
+    fit = dgp.fit(
+        MODEL, rounds.data.known[:240], restarts=1, workers=1, progress=False, method="map"
+    )
     looked = rounds.look(fit, {"heavy tails"})
     (whole,), (searched,) = looked.whole, looked.residuals
     assert whole.held_out.all()
@@ -131,7 +135,7 @@ def test_the_omnibus_test_looks_at_all_that_is_known_without_process_noise(round
 def test_the_search_goes_on_without_process_noise_that_hides_what_is_missing():
     """The input acts five samples late; the fit with process noise explains that by noise."""
     record = oscillator(5, 0.0, seed=1)
-    fit = dgp.fit(MODEL, record[:240], restarts=2, workers=1, progress=False)
+    fit = dgp.fit(MODEL, record[:240], restarts=2, workers=1, progress=False, method="map")
     report = dgp.close_loop(
         fit, record, effects=(effects.DeadTime(), effects.ProcessNoise()), max_rounds=1,
         workers=1, progress=False,
@@ -166,7 +170,7 @@ def test_where_nothing_can_be_added_without_process_noise_the_search_begins_agai
     record = oscillator(0, 0.3, seed=3)
     y = record.outputs[:, 0] + 2.0 * (np.arange(N) >= 270)
     record = record.with_outputs(y)
-    fit = dgp.fit(MODEL, record[:240], restarts=1, workers=1, progress=False)
+    fit = dgp.fit(MODEL, record[:240], restarts=1, workers=1, progress=False, method="map")
     report = dgp.close_loop(
         fit, record, effects=(effect(),), max_rounds=1, workers=1, progress=False
     )

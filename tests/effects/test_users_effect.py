@@ -49,7 +49,7 @@ def test_the_file_is_short_and_the_package_names_the_page() -> None:
 @pytest.mark.usefixtures("users_effect")
 def test_the_loop_names_it_adds_it_and_says_how_long_it_lasts(record: dgp.Record) -> None:
     model = dgp.LinearDynamicGP(1, pairs=1, process_noise=False)
-    fit = dgp.fit(model, record[:240], restarts=2, workers=1, progress=False)
+    fit = dgp.fit(model, record[:240], restarts=2, workers=1, progress=False, method="map")
     names: dict[str, Any] = {"dgp": dgp, "fit": fit, "record": record}
     exec(blocks()[1], names)
     report = names["report"]

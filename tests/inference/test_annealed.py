@@ -12,7 +12,7 @@ from scipy.stats import f
 import pyro_dynogp as dgp
 from pyro_dynogp.criticism.left_out import spread_of
 from pyro_dynogp.inference.density import Potential
-from pyro_dynogp.inference.methods.annealed import FREEDOM, Joint, Student, anneal, around
+from pyro_dynogp.inference.methods.annealed import FREEDOM, Joint, StudentMixture, anneal
 
 
 def tensor(x):
@@ -108,18 +108,33 @@ def test_a_target_that_no_particle_can_reach():
 
 def test_student_start():
     loc, root = tensor([1.0, -2.0]), tensor([[1.0, 0], [0.5, 2]])
-    z, student = around(loc, root, 4000, seed=1)
+    student = StudentMixture(tensor([1.0]), loc[None], root[None])
+    z = student.draw(4000, seed=1)
     value, gradient = student(z)
     exact = dist.MultivariateStudentT(tensor(FREEDOM), loc, root).log_prob(z)
     torch.testing.assert_close(value, exact)
     x = z[:5].clone().requires_grad_()
-    (slope,) = torch.autograd.grad(Student(loc, root).distribution
-                                   .log_prob(x).sum(), x)  # fmt: skip
+    (slope,) = torch.autograd.grad(student(x)[0].sum(), x)
     torch.testing.assert_close(gradient[:5], slope)
     inside = torch.linalg.solve_triangular(root, (z - loc).mT, upper=False)
     # Squared radii over d are F(2, FREEDOM).
     radius = float((inside.square().sum(0) / 2).median())
     assert radius == pytest.approx(f.ppf(0.5, 2, FREEDOM), abs=0.06)
+
+
+def test_a_mixture_of_starts():
+    """Density, gradient and the shares of the components, against Pyro's distributions."""
+    weights, loc = tensor([0.7, 0.3]), tensor([[1.0, -2.0], [-20.0, 5.0]])
+    root = tensor([[[1.0, 0], [0.5, 2]], [[0.2, 0], [0.1, 0.3]]])
+    mixture = StudentMixture(weights, loc, root)
+    z = mixture.draw(1000, seed=2)
+    assert float((z[:, 0] < -10.0).double().mean()) == pytest.approx(0.3, abs=1e-3)
+    x = z[::50].clone().requires_grad_()
+    each = [dist.MultivariateStudentT(tensor(FREEDOM), loc[k], root[k]).log_prob(x) for k in (0, 1)]
+    exact = torch.logsumexp(torch.stack(each, -1) + weights.log(), -1)
+    value, gradient = mixture(x.detach())
+    torch.testing.assert_close(value, exact)
+    torch.testing.assert_close(gradient, torch.autograd.grad(exact.sum(), x)[0])
 
 
 def test_posterior_of_a_conjugate_model():
@@ -134,8 +149,8 @@ def test_posterior_of_a_conjugate_model():
 
     potential = Potential(model, (), {"tau": tensor(1.0), "mu": tensor(0.5)})
     loc = tensor([math.log(1.2), 0.8])
-    z, start = around(loc, 0.6 * torch.eye(2, dtype=torch.float64), 1500, 0)
-    found = anneal(z, start, Joint(potential))
+    start = StudentMixture(tensor([1.0]), loc[None], 0.6 * torch.eye(2, dtype=torch.float64)[None])
+    found = anneal(start.draw(1500, 0), start, Joint(potential))
     values = potential.unpack(found.z)
     n, lam = 5, 0.5
     mean = n * y.mean() / (n + lam)

@@ -240,7 +240,7 @@ class TestElbo:
         model = dgp.Cascade(1, (dgp.Dynamic(pairs=1),))
         scaled = model.scaled_to(train)
         twin = dgp.LinearDynamicGP(inputs=1, pairs=1, scaling=scaled.scaling)
-        optimum = dgp.fit(twin, train, restarts=1, workers=1, progress=False)
+        optimum = dgp.fit(twin, train, restarts=1, workers=1, progress=False, method="map")
         values = {k: v.clone() for k, v in optimum.mode.items()}
         y = (train.outputs[:, 0] - scaled.scaling.output_offset[0]) / scaled.scaling.output_scale[0]
         guide = dgp.LayerGuide(
@@ -268,7 +268,7 @@ class TestStarts:
         model = dgp.Wiener(1, pairs=1, inducing=20).scaled_to(bent)
         layer = model.wires[0].layer
         twin = linear_twin(model, layer, model.scaling)
-        optimum = dgp.fit(twin, bent, restarts=1, workers=1, progress=False)
+        optimum = dgp.fit(twin, bent, restarts=1, workers=1, progress=False, method="map")
         plan = Plan("g", dict(optimum.mode), False, 0)
         start = starting_point(model, model.prepare(bent), plan)
         condition = pyro.poutine.condition(model.collapsed, data=start)

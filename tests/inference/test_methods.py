@@ -20,7 +20,8 @@ class TestShortNames:
     @pytest.mark.parametrize(
         ("model", "method", "options", "expected"),
         [
-            (LINEAR, None, {}, dgp.Mode()),
+            (LINEAR, None, {}, dgp.Importance()),
+            (LINEAR, None, {"draws": 9}, dgp.Importance(9)),
             (wiener(), None, {}, dgp.Normal()),
             (wiener(), None, {"guide": "collapsed", "draws": None}, dgp.Normal()),
             (wiener(), "map", {"optimizer": "lbfgs"}, dgp.Mode("lbfgs")),
@@ -43,7 +44,11 @@ class TestShortNames:
     ("model", "options", "message"),
     [
         (LINEAR, {"method": "svi", "chains": 2}, "chains: expected nothing .* Nuts takes it"),
-        (LINEAR, {"method": "map", "draws": 2}, "draws: .* Normal and Nuts and Trajectories take"),
+        (
+            LINEAR,
+            {"method": "map", "draws": 2},
+            "draws: .* Importance and Normal and Nuts and Trajectories take",
+        ),
         (LINEAR, {"method": "nuts", "particles": 2}, "particles: .* Normal and Trajectories take"),
         (wiener(), {"guide": "gauss-markov", "optimizer": "adam"}, "optimizer"),
         (wiener(), {"guide": "gauss-markov", "method": "nuts"}, "method: expected 'svi' with this"),
@@ -71,10 +76,10 @@ def test_an_option_that_no_method_has(record):
 
 class TestDefaults:
     def test_a_cascade_of_one_dynamic_layer_is_a_linear_model(self, record):
-        """Linear dynamics with outliers: its default is the posterior mode."""
+        """Linear dynamics with outliers: its default is that of linear models."""
         model = dgp.Cascade(1, (dgp.Dynamic(pairs=1),), dgp.StudentT())
         fit = dgp.fit(model, record[:60], **QUICK)
-        assert fit.method == "map"
+        assert fit.method == "importance"
         svi = dgp.fit(model, record[:60], method="svi", draws=3, **QUICK)
         assert not svi.posterior.points  # one normal of all sites
         assert {site.name for site in svi.posterior.sites} == set(svi.draws)

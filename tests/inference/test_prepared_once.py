@@ -71,7 +71,7 @@ def test_once_a_run_and_once_a_verb(name, record, counts):
 
 def test_several_records(record, counts):
     parts = record.split(40)
-    dgp.fit(MODELS["linear"], parts, restarts=2, steps=5, workers=1, progress=False)
+    dgp.fit(MODELS["linear"], parts, restarts=2, steps=5, workers=1, progress=False, method="map")
     assert counts == {"checked": 1, "scaled": 2, "grid": 2, "tensors": 2, "learnt": 1}
 
 

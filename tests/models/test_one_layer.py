@@ -88,7 +88,10 @@ def test_close_loop(both):
     drifting = record.with_outputs(record.outputs + 0.002 * np.arange(360)[:, None])
     reports = [
         dgp.close_loop(
-            dgp.fit(model, drifting[:180], **QUICK), drifting, effects=effects, **options
+            dgp.fit(model, drifting[:180], **QUICK, method="map"),
+            drifting,
+            effects=effects,
+            **options,
         )
         for model in (dgp.LinearDynamicGP(1, pairs=1), dgp.Cascade(1, (dgp.Dynamic(pairs=1),)))
     ]
@@ -102,10 +105,14 @@ def test_a_linear_plant_takes_every_likelihood():
     record = simulate_record(modes, 0.05, n=100)
     for likelihood in (dgp.StudentT(), dgp.Heteroscedastic(4), dgp.Heteroscedastic(4, of="output")):
         model = dgp.Cascade(1, (dgp.Dynamic(pairs=1),), likelihood)
-        fit = dgp.fit(model, record[:70], restarts=1, steps=3, workers=1, progress=False)
+        fit = dgp.fit(
+            model, record[:70], restarts=1, steps=3, workers=1, progress=False, method="map"
+        )
         assert fit.method == "map"
         same = dgp.LinearDynamicGP(1, pairs=1, likelihood=likelihood)
-        again = dgp.fit(same, record[:70], restarts=1, steps=3, workers=1, progress=False)
+        again = dgp.fit(
+            same, record[:70], restarts=1, steps=3, workers=1, progress=False, method="map"
+        )
         equal(fit.start_energies, again.start_energies)
         forecast = fit.forecast(record[:70], record[70:])
         assert np.isfinite(forecast.sd).all()

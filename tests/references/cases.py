@@ -73,21 +73,21 @@ def linear_drives(**options: Any) -> dict[str, Any]:
 def linear_furnace(**options: Any) -> dict[str, Any]:
     """A linear fit of the furnace with options of the model."""
     model = dgp.LinearDynamicGP(inputs=1, pairs=2, **options)
-    return fitted(dgp.fit(model, furnace(), restarts=3, **QUICK), furnace())
+    return fitted(dgp.fit(model, furnace(), restarts=3, **QUICK, method="map"), furnace())
 
 
 def linear_two_outputs() -> dict[str, Any]:
     """Two outputs."""
     record = two_outputs()
     model = dgp.LinearDynamicGP(inputs=1, outputs=2, pairs=1)
-    return fitted(dgp.fit(model, record, restarts=3, **QUICK), record)
+    return fitted(dgp.fit(model, record, restarts=3, **QUICK, method="map"), record)
 
 
 def linear_two_records() -> dict[str, Any]:
     """Two records that share all parameters."""
     record = drives()
     pair = (record[:100], record[120:260])
-    fit = dgp.fit(dgp.LinearDynamicGP(inputs=1, pairs=2), pair, restarts=3, **QUICK)
+    fit = dgp.fit(dgp.LinearDynamicGP(inputs=1, pairs=2), pair, restarts=3, **QUICK, method="map")
     return fitted(fit, pair[1])
 
 

@@ -24,7 +24,9 @@ from pyro.distributions import MultivariateStudentT
 from torch import Tensor
 from tqdm import tqdm
 
-from pyro_dynogp.inference.density import Potential, each_with_gradient
+from pyro_dynogp.inference.density import Potential, each_with_gradient, within_edges
+from pyro_dynogp.inference.log_joint import Direct
+from pyro_dynogp.support.parallel import seeded
 
 # Effective share of particles after a step; one in so many of all particles starts a chain.
 EFFECTIVE, CHAINS = 0.5, 4
@@ -75,25 +77,75 @@ class Joint:
 
 
 @dataclass(frozen=True, eq=False)
-class Student:
-    """Multivariate Student-t around an optimum, with the scale of a normal there."""
+class Prior:
+    """The prior of all sites of a model, in a potential's coordinates.
 
+    Attributes:
+        potential: of a `Model` whose trajectories are integrated out. density: of its sites.
+    """
+
+    potential: Potential
+    density: Direct
+
+    def __call__(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Value (S,), and gradient (S, d)."""
+        far = ~(z.abs() <= REACH).all(-1)
+        energy, slope = each_with_gradient(self._energy, z.masked_fill(far[:, None], 0.0))
+        return -energy.masked_fill(far, torch.inf), -slope.masked_fill(far[:, None], 0.0)
+
+    def _energy(self, z: Tensor) -> Tensor:
+        values = self.potential.unpack(z)
+        return -self.density.prior.log_prob(values) - self.potential.log_jacobian(z)
+
+    def draw(self, count: int, seed: int) -> Tensor:
+        """Vectors (S, d)."""
+        with seeded(seed), torch.no_grad():
+            values = {site.name: site.prior.sample((count,)) for site in self.density.sites}
+        inverse = [
+            site.transform.inv(values[site.name]).reshape(count, -1)
+            for site in self.potential.sites
+        ]
+        return within_edges(torch.cat(inverse, -1))
+
+
+@dataclass(frozen=True, eq=False)
+class StudentMixture:
+    """Multivariate Student-t distributions around optima, with the scales of normals there.
+
+    Attributes:
+        weights: (K,) that add up to one. loc: (K, d). scale_tril: (K, d, d), lower.
+    """
+
+    weights: Tensor
     loc: Tensor
     scale_tril: Tensor
 
     @property
     def distribution(self) -> MultivariateStudentT:
-        """As Pyro has it."""
-        return MultivariateStudentT(
-            torch.tensor(FREEDOM, dtype=torch.float64), self.loc, self.scale_tril
-        )
+        """Of all components, as Pyro has it."""
+        freedom = torch.tensor(FREEDOM, dtype=torch.float64)
+        return MultivariateStudentT(freedom, self.loc, self.scale_tril)
 
     def __call__(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Value (S,) and gradient (S, d)."""
-        departure = torch.cholesky_solve((z - self.loc).unsqueeze(-1), self.scale_tril).squeeze(-1)
-        square = ((z - self.loc) * departure).sum(-1, keepdim=True)
-        gradient = -(FREEDOM + z.shape[-1]) * departure / (FREEDOM + square)
-        return self.distribution.log_prob(z), gradient
+        each = self.distribution.log_prob(z.unsqueeze(1)) + self.weights.log()  # (S, K)
+        off = (z.unsqueeze(1) - self.loc).permute(1, 2, 0)  # (K, d, S)
+        departure = torch.cholesky_solve(off, self.scale_tril)
+        square = (off * departure).sum(1, keepdim=True)
+        slopes = -(FREEDOM + z.shape[-1]) * departure / (FREEDOM + square)
+        gradient = torch.einsum("sk,kds->sd", torch.softmax(each, -1), slopes)
+        return torch.logsumexp(each, -1), gradient
+
+    def draw(self, count: int, seed: int) -> Tensor:
+        """First particles (S, d), of each component in proportion to its weight."""
+        generator = torch.Generator().manual_seed(seed)
+        d = self.loc.shape[-1]
+        x = torch.randn(count, d, generator=generator, dtype=torch.float64)
+        # A chi-squared number by the sum of squares: torch's gamma takes no generator.
+        squares = torch.randn(count, int(FREEDOM), generator=generator, dtype=torch.float64)
+        spread = (FREEDOM / squares.square().sum(-1, keepdim=True)).sqrt()
+        k = _resample(self.weights.log(), count, generator)
+        return self.loc[k] + spread * torch.einsum("sij,sj->si", self.scale_tril[k], x)
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,13 +325,3 @@ def _move(
     accept = chance < change
     rate = float(change.clamp_max(0.0).exp().mean())
     return there.where(accept, now), rate
-
-
-def around(loc: Tensor, root: Tensor, count: int, seed: int) -> tuple[Tensor, Student]:
-    """First particles (S, d) around a normal of mean (d,) and root (d, d), and their density."""
-    generator = torch.Generator().manual_seed(seed)
-    x = torch.randn(count, len(loc), generator=generator, dtype=torch.float64)
-    # A chi-squared number by the sum of squares: torch's gamma takes no generator.
-    squares = torch.randn(count, int(FREEDOM), generator=generator, dtype=torch.float64)
-    spread = (FREEDOM / squares.square().sum(-1, keepdim=True)).sqrt()
-    return loc + spread * (x @ root.mT), Student(loc, root)

@@ -7,6 +7,7 @@ from dataclasses import fields
 from typing import Any
 
 from pyro_dynogp.inference.methods.base import Method
+from pyro_dynogp.inference.methods.importance import Importance
 from pyro_dynogp.inference.methods.mode import Mode
 from pyro_dynogp.inference.methods.nuts import Nuts
 from pyro_dynogp.inference.methods.optima import Normal
@@ -14,7 +15,9 @@ from pyro_dynogp.inference.methods.trajectories import Trajectories
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.support.errors import invalid
 
-CLASSES: Mapping[str, type[Mode | Normal | Nuts | Trajectories]] = {
+Kind = type[Importance | Mode | Normal | Nuts | Trajectories]
+CLASSES: Mapping[str, Kind] = {
+    "importance": Importance,
     "map": Mode,
     "svi": Normal,
     "nuts": Nuts,
@@ -29,8 +32,8 @@ def method_of(
     """The method object that a short name and loose options stand for.
 
     Args:
-        method: "map", "svi", "nuts", an object, or None for what suits the model: "svi" with static
-            layers or a guide, else "map".
+        method: "importance", "map", "svi", "nuts", an object, or None for what suits the model:
+            "svi" with static layers or a guide, else "importance".
         model: that is to be fitted.
         options: of the method by name; None as a value is an option that is not given, and so is
             ``guide="collapsed"``.
@@ -61,9 +64,9 @@ def method_of(
             raise invalid("method", expected="'map', 'svi', 'nuts' or a method", got=repr(method))
         return method
     if method is None:
-        method = "svi" if model.has_function or "guide" in given else "map"
+        method = "svi" if model.has_function or "guide" in given else "importance"
     if method not in CLASSES:
-        raise invalid("method", expected="'map', 'svi' or 'nuts'", got=repr(method))
+        raise invalid("method", expected="'importance', 'map', 'svi' or 'nuts'", got=repr(method))
     kind = CLASSES[method]
     if "guide" in given:
         if method != "svi":
@@ -82,7 +85,7 @@ def method_of(
     return kind(**{takes[name]: value for name, value in given.items()})
 
 
-def _options(kind: type[Mode | Normal | Nuts | Trajectories]) -> dict[str, str]:
+def _options(kind: Kind) -> dict[str, str]:
     """The field of a method by the name of the loose option."""
     names = {field: option for option, field in FIELDS.items()}
     return {names.get(f.name, f.name): f.name for f in fields(kind)}

@@ -1,0 +1,250 @@
+r"""Draws of the posterior of all parameters by importance sampling around its optima.
+
+The proposal is a mixture of multivariate Student-t distributions, one around each optimum that
+carries weight, with the covariance that Laplace's approximation gives there, in coordinates without
+bent ridges (`inference.cascade_coordinates`). Every draw has the density of the whole mixture, so
+that ratios of the posterior over it give each optimum its posterior probability (Owen 2013, chapter
+9). Where Pareto's k says that the ratios are not to be trusted, the draws are annealed from the
+mixture to the posterior itself (`inference.methods.annealed`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pyro_dynogp.inference.cascade_coordinates import StraightPotential
+from pyro_dynogp.inference.density import WALL, Potential
+from pyro_dynogp.inference.log_joint import Direct
+from pyro_dynogp.inference.methods.annealed import (
+    Annealed,
+    Joint,
+    Prior,
+    StudentMixture,
+    anneal,
+)
+from pyro_dynogp.inference.pareto import effective, good_k, psis
+from pyro_dynogp.inference.posterior_draws import PosteriorDraws
+from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.prepared import PreparedRecord
+from pyro_dynogp.support.frozen import FrozenMapping
+from pyro_dynogp.support.parallel import seeded
+
+Values = Mapping[str, Tensor]
+
+# Optima that the proposal has components around, and the least weight of one.
+MOST_OPTIMA, LEAST_WEIGHT = 4, 0.02
+# Optima whose energies differ by less [nats] are one.
+SAME = 0.01
+# Iterations towards the centre of each component, which need not be found to the last digit.
+STEPS = 25
+# Samples of the record times draws, which bounds the work, and the draws between which it does.
+WORK, FEWEST, MOST = 2_000_000, 200, 1000
+# Samples up to which particles of the prior are annealed, too: with few, most of the posterior may
+# be far from all optima.
+SHORT = 100
+# Most samples of a record along which draws are annealed: with Gaussian noise, and without.
+LONGEST, LONGEST_OTHERS = 20_000, 2_000
+
+
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """What importance sampling comes to.
+
+    Attributes:
+        draws: with the ratios of the proposal, or of the posterior itself where annealed.
+        log_weights: (S,) normalised, smoothed. k: Pareto shape of the proposal's ratios.
+        optima: how many components the proposal has. annealed: whether the draws were.
+        mode: values of all sites at the optimum that carries most weight.
+    """
+
+    draws: PosteriorDraws
+    log_weights: np.ndarray
+    k: float
+    optima: int
+    annealed: bool
+    mode: Values
+
+    @property
+    def independent(self) -> float:
+        """Effective number of independent draws."""
+        if self.draws.ancestor is None:
+            return effective(self.log_weights)
+        sizes = np.unique(self.draws.ancestor, return_counts=True)[1] / len(self.draws)
+        return float(1.0 / np.square(sizes).sum())
+
+    def resampled(self, count: int) -> dict[str, Tensor]:
+        """Draws (`count`, *shape) of equal weight, by systematic resampling."""
+        chosen = systematic(np.exp(self.log_weights), count)
+        return {name: x[chosen] for name, x in self.draws.values.items()}
+
+
+def systematic(weights: np.ndarray, count: int, shift: float = 0.5) -> np.ndarray:
+    """Indices (`count`,) in proportion to weights (S,)."""
+    edges = np.cumsum(weights) / weights.sum()
+    at = (np.arange(count) + shift) / count
+    return np.minimum(np.searchsorted(edges, at), len(weights) - 1)
+
+
+def draws_for(samples: int) -> int:
+    """How many draws a record of so many samples is worth."""
+    return int(np.clip(WORK // max(samples, 1), FEWEST, MOST))
+
+
+def can_anneal(model: Model, samples: int) -> bool:
+    """Whether annealing can be afforded, at some 30 densities a draw.
+
+    Not where static functions make every density a run of the moment-matching filter, nor along
+    records so long that parameters are all but known.
+    """
+    exact = model.is_linear and model.likelihood.gaussian
+    return not model.has_function and samples <= (LONGEST if exact else LONGEST_OTHERS)
+
+
+def sample_around(
+    model: Model,
+    records: Sequence[PreparedRecord],
+    optima: Sequence[Values],
+    *,
+    count: int | None = None,
+    seed: int = 0,
+    progress: bool = False,
+) -> Sampled:
+    """Draws of the posterior from around its optima.
+
+    Args:
+        model: with all trajectories integrated out. records: to which it is fitted.
+        optima: values of all sites, the best first. count: of draws; None for what the length of
+            the records suggests. seed: of them. progress: whether annealing shows a bar.
+    """
+    samples = samples_of(records)
+    count = count or draws_for(samples)
+    with seeded(seed):
+        leading, weights = weighed(Potential(model, (records,), optima[0]), optima)
+        potential = StraightPotential(model, (records,), leading[0])
+        proposal = proposal_of(potential, leading, weights)
+        z = proposal.draw(count, seed)
+        target = Joint(potential, samples)
+        log_target, log_proposal = target(z)[0], proposal(z)[0]
+        log_weights, shape = psis((log_target - log_proposal).numpy())
+        k, kind = float(shape), f"Student-t around {plural(len(weights))}"
+        ancestor, log_q = None, log_proposal
+        islands: list[Annealed] = []
+        if not k <= good_k(count) and can_anneal(model, samples):
+            islands = run_of(proposal, z, target, seed, progress)
+            if samples <= SHORT and model.priors == "default":
+                plain = Potential(model, (records,), leading[0])
+                found = from_prior(plain, count, samples, seed, progress)
+                with torch.no_grad():
+                    islands += [replace(x, z=potential.pack(plain.unpack(x.z))) for x in found]
+                kind += " and from the prior" if found else ""
+        annealed = bool(islands)
+        if annealed:
+            kind = f"annealed from {kind}"
+            z, ancestor = pooled(islands, count)
+            log_target = target(z)[0]
+            log_weights = np.full(count, -np.log(count))
+        with torch.no_grad():
+            values = FrozenMapping(potential.unpack(z))
+            log_jacobian = potential.log_jacobian(z)
+    draws = PosteriorDraws(
+        values,
+        (log_target - log_jacobian).numpy(),
+        None if annealed else (log_q - log_jacobian).numpy(),
+        np.zeros(count, dtype=int),
+        kind,
+        ancestor,
+    )
+    return Sampled(draws, log_weights, k, len(weights), annealed, leading[0])
+
+
+def run_of(
+    start: StudentMixture | Prior, z: Tensor, target: Joint, seed: int, progress: bool
+) -> list[Annealed]:
+    """One run of annealing; none where particles cannot get from the start to the posterior."""
+    try:
+        return [anneal(z, start, target, seed=seed, progress=progress)]
+    except RuntimeError:  # Pareto's k of the draws that there are then says how good they are
+        return []
+
+
+def from_prior(
+    potential: Potential, count: int, samples: int, seed: int, progress: bool
+) -> list[Annealed]:
+    """Particles annealed from the prior: straight coordinates serve around an optimum alone."""
+    density = potential.log_density
+    assert isinstance(density, Direct)  # of a model whose trajectories are integrated out
+    prior = Prior(potential, density)
+    z = prior.draw(count, seed)
+    return run_of(prior, z, Joint(potential, samples), seed, progress)
+
+
+def pooled(islands: Sequence[Annealed], count: int) -> tuple[Tensor, np.ndarray]:
+    """Particles (`count`, d) of several runs, and the first particle that each descends from.
+
+    Each run estimates the evidence without bias, and its particles stand for so much of it: where
+    one start has missed most of the posterior, its estimate is low (Verge, Dubarry, Del Moral &
+    Moulines, Statistics and Computing 25:243, 2015).
+    """
+    evidence = np.array([island.log_evidence for island in islands])
+    share = np.exp(evidence - evidence.max())
+    chosen = systematic(share, count)
+    z, ancestor = [], []
+    for index, island in enumerate(islands):
+        own = int((chosen == index).sum())
+        some = systematic(np.ones(len(island.z)), own)
+        z.append(island.z[some])
+        ancestor.append(island.ancestor[some] + index * len(island.z))
+    return torch.cat(z), np.unique(np.concatenate(ancestor), return_inverse=True)[1]
+
+
+def weighed(potential: Potential, optima: Sequence[Values]) -> tuple[list[Values], Tensor]:
+    """Values at the optima that carry weight, the weightiest first, and their weights (K,).
+
+    The highest optimum may be a needle: with few samples a system that passes through all of them.
+    What counts is the mass around each, by Laplace's approximation. Log densities of draws spread
+    by sqrt(d/2) nats, so that an evidence says hardly more than that about a mass: weights are
+    exp(evidence / sqrt(d/2)). The posterior probabilities are for the importance ratios to say.
+    """
+    different = distinct(potential, optima)
+    evidence = torch.tensor([potential.log_evidence(one) for one in different], dtype=torch.float64)
+    temper = float(np.sqrt(0.5 * potential.size))
+    weights, order = torch.softmax(evidence / temper, 0).sort(descending=True)
+    order = order[weights >= LEAST_WEIGHT][:MOST_OPTIMA]
+    weights = weights[: len(order)]
+    return [different[index] for index in order], weights / weights.sum()
+
+
+def proposal_of(potential: Potential, optima: Sequence[Values], weights: Tensor) -> StudentMixture:
+    """Student-t distributions around optima, in the coordinates of a potential."""
+    found = [potential.laplace(values, STEPS) for values in optima]
+    return StudentMixture(
+        weights,
+        torch.stack([torch.as_tensor(centre) for centre, _ in found]),
+        torch.stack([torch.as_tensor(root) for _, root in found]),
+    )
+
+
+def distinct(potential: Potential, optima: Sequence[Values]) -> list[Values]:
+    """Optima, each density once: what has the same one differs in the names of pairs."""
+    points = np.stack([potential.pack(values).numpy() for values in optima])
+    energies = potential.values_and_gradients(points)[0]
+    kept: list[int] = []
+    for index in np.argsort(energies, kind="stable").tolist():
+        if energies[index] < WALL and (not kept or energies[index] - energies[kept[-1]] > SAME):
+            kept.append(index)
+    return [optima[index] for index in kept]
+
+
+def samples_of(records: Sequence[PreparedRecord]) -> int:
+    """Measured numbers of all records."""
+    return sum(record.observations.numel() for record in records)
+
+
+def plural(optima: int) -> str:
+    """The number of optima in words."""
+    return "the mode" if optima == 1 else f"{optima} optima"

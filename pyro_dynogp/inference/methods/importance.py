@@ -1,0 +1,86 @@
+"""The posterior of all parameters by importance sampling around the optima."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.importance_sampling import sample_around
+from pyro_dynogp.inference.methods.base import Problem
+from pyro_dynogp.inference.methods.mode import best_optima, check_optimizer
+from pyro_dynogp.inference.optimise.maximum import Optimizer, Optimum
+from pyro_dynogp.inference.pareto import good_k
+from pyro_dynogp.inference.posteriors import Sampled
+from pyro_dynogp.inference.run import Run
+from pyro_dynogp.models.model import Model
+from pyro_dynogp.support.errors import verify_fields, warn
+from pyro_dynogp.support.frozen import FrozenMapping
+
+
+@dataclass(frozen=True)
+class Importance:
+    """Draws of all parameters: importance sampling around the optima, annealed where that fails.
+
+    Optima are found as by `Mode`. Draws of Student-t distributions around up to four of them get
+    weights by the posterior; where Pareto's k of the weights is too high, and the model has no
+    static functions, they are annealed to it (`inference.importance_sampling`). Bands then know
+    the uncertainty of every parameter, and each optimum has its posterior probability.
+
+    Attributes:
+        draws: posterior draws to keep, of equal weight.
+        optimizer: for the climbs, as of `Mode`.
+
+    Raises:
+        ValueError: on an unknown optimizer, or fewer than one draw.
+    """
+
+    draws: int = 300
+    optimizer: Optimizer | None = None
+
+    def __post_init__(self) -> None:
+        verify_fields(self)
+        check_optimizer(self.optimizer)
+
+    def check(self, model: Model, *, warm: bool) -> None:
+        """Every model; not every optimizer takes every model."""
+        check_optimizer(self.optimizer, model)
+
+    @property
+    def identity(self) -> object:
+        """All options."""
+        return self
+
+    def __call__(self, problem: Problem, run: Run) -> Fitted:
+        """The draws, the mode and how it was found; steps of the run are those of each start."""
+        optima = best_optima(problem, run, self.optimizer, run.steps)
+        return with_draws_around(problem, optima, run, self.draws)
+
+
+def with_draws_around(problem: Problem, optima: list[Optimum], run: Run, draws: int) -> Fitted:
+    """The fit that draws around several optima, the best first, are."""
+    found = sample_around(
+        problem.target,
+        problem.records,
+        [optimum.values for optimum in optima],
+        seed=run.seed,
+        progress=run.progress,
+    )
+    good = good_k(len(found.draws))
+    if not found.annealed and not found.k <= good:
+        warn(
+            f"fit: Pareto's k of the posterior's draws is {found.k:.2f} (good: up to {good:.2f}): "
+            "do not trust their weights, and bands made of them. Use method='nuts' or 'svi', or a "
+            "smaller model."
+        )
+    values = FrozenMapping(found.resampled(draws))
+    diagnostics = {
+        "iterations": float(len(optima[0].history)),
+        "pareto_k": found.k,
+        "optima": float(found.optima),
+        "annealed": float(found.annealed),
+        "independent draws": found.independent,
+    }
+    return problem.fitted(
+        run, Sampled(values, "importance", source=found.draws), values, found.mode,
+        optima[0].history, [optimum.energy for optimum in optima], diagnostics,
+    )  # fmt: skip
