@@ -43,7 +43,7 @@ SAME = 0.01
 # Iterations towards the centre of each component, which need not be found to the last digit.
 STEPS = 25
 # Samples of the record times draws, which bounds the work, and the draws between which it does.
-WORK, FEWEST, MOST = 2_000_000, 200, 1000
+WORK, FEWEST, MOST = 300_000, 200, 1000
 # Samples up to which particles of the prior are annealed, too: with few, most of the posterior may
 # be far from all optima.
 SHORT = 100
@@ -111,6 +111,7 @@ def sample_around(
     optima: Sequence[Values],
     *,
     count: int | None = None,
+    longest: int | None = None,
     seed: int = 0,
     progress: bool = False,
 ) -> Sampled:
@@ -119,7 +120,8 @@ def sample_around(
     Args:
         model: with all trajectories integrated out. records: to which it is fitted.
         optima: values of all sites, the best first. count: of draws; None for what the length of
-            the records suggests. seed: of them. progress: whether annealing shows a bar.
+            the records suggests. longest: most samples along which they are annealed; None for
+            what can be afforded. seed: of them. progress: whether annealing shows a bar.
     """
     samples = samples_of(records)
     count = count or draws_for(samples)
@@ -134,7 +136,8 @@ def sample_around(
         k, kind = float(shape), f"Student-t around {plural(len(weights))}"
         ancestor, log_q = None, log_proposal
         islands: list[Annealed] = []
-        if not k <= good_k(count) and can_anneal(model, samples):
+        short = longest is None or samples <= longest
+        if not k <= good_k(count) and short and can_anneal(model, samples):
             islands = run_of(proposal, z, target, seed, progress)
             if samples <= SHORT and model.priors == "default":
                 plain = Potential(model, (records,), leading[0])

@@ -19,12 +19,12 @@ from pyro_dynogp.inference.methods.nuts import sample_posterior
 from pyro_dynogp.inference.methods.optima import POLISH, Hyperparameters, posterior_of
 from pyro_dynogp.inference.methods.svi import Schedule
 from pyro_dynogp.inference.optimise.gauss_newton import has_innovations
-from pyro_dynogp.inference.optimise.maximum import Effort, Optimum, maximise
+from pyro_dynogp.inference.optimise.maximum import Effort, Optimum, maximise, optimizer_near
 from pyro_dynogp.inference.posteriors import Mixture, Sampled, draws_of_guide
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.dynamic import Values
 from pyro_dynogp.inference.starts.extended import extended_starts
-from pyro_dynogp.inference.starts.plans import linear_starts, optimizer_near
+from pyro_dynogp.inference.starts.plans import linear_starts
 from pyro_dynogp.inference.starts.poles import grown
 from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
 from pyro_dynogp.models.model import Model

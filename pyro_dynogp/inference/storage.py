@@ -32,10 +32,8 @@ from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 
 FORMAT = "pyro_dynogp.fit"
-# Version 6 is written; 4 and 5 are read, too.
-VERSION, OLDEST = 6, 4
-# The last version of files without a digest.
-UNMARKED = 5
+# Version 6 is written; 4 and 5 are read, too, which have no digest.
+VERSION, OLDEST, UNMARKED = 6, 4, 5
 # The models that a file may name: a file never decides what code is run.
 MODELS = ("Model", "Cascade", "LinearDynamicGP")
 # Arrays of draws with densities, where there are such.

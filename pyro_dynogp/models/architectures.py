@@ -12,7 +12,7 @@ from pyro_dynogp.lti.modes import NoiseStructure
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.structure import ModelOptions
 from pyro_dynogp.models.wiring import Dynamic, Layer, Static
-from pyro_dynogp.support.errors import verify
+from pyro_dynogp.support.errors import COUNT, verify
 
 
 def LinearDynamicGP(
@@ -187,6 +187,7 @@ def ParallelWienerHammerstein(
         >>> [wire.sources for wire in ParallelWienerHammerstein(1).wires]
         [('inputs',), ('g1',), ('inputs',), ('g2',), ('f1', 'f2')]
     """
+    COUNT.check("branches", branches)
     first, second = pairs if isinstance(pairs, tuple) else (pairs, pairs)
     noise = process_noise if isinstance(process_noise, tuple) else (process_noise,) * 2
     layers: list[Layer] = []

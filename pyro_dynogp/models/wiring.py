@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from numbers import Real
 
+import pyro.distributions as dist
+
 from pyro_dynogp.layers.kernels import KernelPrior
 from pyro_dynogp.models.layer import Dynamic as Dynamic
 from pyro_dynogp.models.layer import Known as Known
@@ -180,7 +182,8 @@ def _letter(layer: Layer) -> str:
 
 def _check_feedback(names: Sequence[str], layers: Sequence[Layer]) -> None:
     for place, layer in enumerate(layers):
-        instance(f"skip of layer {names[place]!r}", layer.skip, tuple)
+        for option in ("skip", "sees"):
+            instance(f"{option} of layer {names[place]!r}", getattr(layer, option), tuple)
         if not isinstance(layer, Dynamic):
             continue
         instance(f"feedback of layer {names[place]!r}", layer.feedback, tuple)
@@ -221,12 +224,23 @@ def _check_layer(name: str, layer: Layer) -> None:
         COUNT.check(f"support of layer {name!r}", layer.support)
         KernelPrior(name, layer.kernel, 1)  # refuses what is no kernel of one function
     elif isinstance(layer, Known):
-        low, high = layer.range or (0.0, 1.0)
-        if not low < high:
-            raise invalid(f"range of layer {name!r}", expected="low < high", got=f"{low}, {high}")
-        if not callable(layer.function):
-            got = repr(layer.function)
-            raise invalid(f"function of layer {name!r}", expected="a function of torch", got=got)
+        _check_known(name, layer)
+
+
+def _check_known(name: str, layer: Known) -> None:
+    if not callable(layer.function):
+        got = repr(layer.function)
+        raise invalid(f"function of layer {name!r}", expected="a function of torch", got=got)
+    instance(f"parameters of layer {name!r}", layer.parameters, Mapping)
+    for parameter, prior in layer.parameters.items():
+        instance(f"parameters of layer {name!r}: a name", parameter, str)
+        instance(f"parameters of layer {name!r}: {parameter}", prior, dist.Distribution)
+    ends = (0.0, 1.0) if layer.range is None else layer.range
+    numbers = isinstance(ends, tuple | list) and all(isinstance(end, Real) for end in ends)
+    if not (numbers and len(ends) == 2 and ends[0] < ends[1]):
+        raise invalid(
+            f"range of layer {name!r}", expected="(low, high) with low < high", got=repr(ends)
+        )
 
 
 def _check_limits(name: str, layer: Static, channels: int, last: bool) -> None:

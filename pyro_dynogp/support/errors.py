@@ -125,7 +125,7 @@ SHARE = between(0.0, 1.0, "a number between 0 and 1")
 RULES = {
     **dict.fromkeys(("draws", "samples", "particles", "chains", "warmup", "steps",
                      "horizon", "points", "workers", "max_rounds", "tries", "channels", "outputs",
-                     "inducing", "pairs", "brownian", "count", "width"), COUNT),
+                     "inducing", "pairs", "brownian", "count", "width", "longest"), COUNT),
     **dict.fromkeys(("restarts", "prior_samples", "refits", "channel", "inputs", "fed"), NUMBER),
     **dict.fromkeys(("progress", "process_noise", "feedthrough", "learn_locations", "pathwise"),
                     SWITCH),

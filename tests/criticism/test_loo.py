@@ -291,7 +291,7 @@ def test_what_is_refused(linear, short):
         dgp.loo(linear, short[:40], target="missing sample", **QUIET)
     with pytest.raises(ValueError, match="begin: expected a share between 0 and 1"):
         dgp.loo(linear, target="forecast", begin=1.5, **QUIET)
-    with pytest.raises(ValueError, match="folds: expected a whole number from 2"):
+    with pytest.raises(ValueError, match="folds: expected a whole number >= 2"):
         dgp.loo(linear, target="new record", folds=1, **QUIET)
     with pytest.raises(ValueError, match="parameters: expected 'posterior' or 'mode'"):
         dgp.loo(linear, target="missing sample", parameters="map", **QUIET)
@@ -358,7 +358,7 @@ def test_the_mode_of_a_cascade_is_no_posterior(bent, monkeypatch):
 
 def test_a_cascade_with_its_optima(bent, monkeypatch):
     """Ratios of inducing values and first states are good; what they leave out is said."""
-    monkeypatch.setattr("pyro_dynogp.inference.refit.CASCADE_STEPS", 60)
+    monkeypatch.setattr("pyro_dynogp.inference.refit.ADAM_STEPS", 60)
     N = 40
     options = {"restarts": 1, "steps": 60}
     fit = dgp.fit(dgp.Wiener(1, pairs=1, inducing=5), bent[:N], **options, **QUIET)

@@ -128,7 +128,7 @@ def test_what_is_refused(model, blank):
         ({"method": "laplace"}, "method: expected one of \\['importance', 'map', 'svi', 'nuts'\\]"),
         ({"replicates": 1}, "replicates: expected a whole number >= 2"),
         ({"draws": 5}, "draws: expected a whole number >= 9"),
-        ({"level": 1.0}, "level: expected a probability"),
+        ({"level": 1.0}, "level: expected a number between 0 and 1"),
         ({"checkpoint": "folder"}, "checkpoint: expected none"),
     ):
         with pytest.raises(ValueError, match=words):

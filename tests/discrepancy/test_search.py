@@ -191,7 +191,7 @@ def test_a_gain_has_to_be_more_than_two_standard_errors():
 
 
 def test_settings_say_what_is_wrong():
-    with pytest.raises(ValueError, match="cap: expected a number > 0, got 0"):
+    with pytest.raises(ValueError, match="cap: expected a finite number > 0, got 0"):
         LoopSettings(cap=0.0)
     with pytest.raises(ValueError, match="fit_share and search_share: expected a sum below 1"):
         LoopSettings(fit_share=0.8)

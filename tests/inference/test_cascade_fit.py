@@ -292,8 +292,11 @@ class TestErrors:
         [
             ({"guide": "mean-field"}, "guide: expected 'collapsed', one of"),
             ({"guide": "gauss-markov", "method": "map"}, "method: expected 'svi' with this guide"),
-            ({"method": "laplace"}, "method: expected 'map', 'svi' or 'nuts'"),
-            ({"hyperparameters": "exact"}, "hyperparameters: expected 'map', 'normal' or"),
+            ({"method": "laplace"}, "method: expected 'importance', 'map', 'svi' or 'nuts'"),
+            (
+                {"hyperparameters": "exact"},
+                "expected 'map', 'normal' or 'multivariate",
+            ),
             ({"restarts": 0}, "restarts: expected a whole number >= 1"),
             ({"steps": 0}, "steps: expected a whole number >= 1"),
             ({"particles": 0}, "particles: expected a whole number >= 1"),

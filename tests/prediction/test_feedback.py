@@ -168,7 +168,7 @@ def test_same_bits_with_one_and_two_workers():
         (lambda: spring(integrate="none"), "cannot be sample sites"),
         (lambda: spring(likelihood=dgp.Heteroscedastic(of="output")), "varies with the inputs"),
         (lambda: dgp.Cascade(1, (dgp.Dynamic(feedback=("g",)),)), "later static layers"),
-        (lambda: dgp.Cascade(1, (dgp.Dynamic(feedback="f"), dgp.Static())), "a tuple of names"),
+        (lambda: dgp.Cascade(1, (dgp.Dynamic(feedback="f"), dgp.Static())), "expected a tuple"),
         (
             lambda: dgp.Cascade(1, (dgp.Static(), dgp.Dynamic(feedback=("f",)))),
             "of later static layers, of []",

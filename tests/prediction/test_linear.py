@@ -212,7 +212,7 @@ def test_wrong_uses(map_fit, record, two_outputs):
     with pytest.raises(ValueError, match="one Record"):
         map_fit.simulate([record])
     blank = dgp.Record(time=past.time, inputs=past.inputs)
-    with pytest.raises(ValueError, match="past: expected outputs"):
+    with pytest.raises(ValueError, match="past: expected measured outputs"):
         map_fit.forecast(blank, future)
     with pytest.raises(ValueError, match="record: expected measured outputs"):
         map_fit.predict(blank)

@@ -54,7 +54,7 @@ class World:
 
     @functools.cached_property
     def fit(self):
-        return dgp.fit(self.linear, self.record, **QUICK)
+        return dgp.fit(self.linear, self.record, method="map", **QUICK)
 
     @functools.cached_property
     def bent(self):
@@ -85,6 +85,7 @@ JUNK = ("text", b"bytes", [1], {"a": 1}, 1 + 2j, object)
 COUNT = (0, -1, 1.5, np.nan, np.inf, True, "2", [2], 2j)
 NUMBER = (-1, 1.5, np.nan, True, "2", [2])
 SEED = (-1, 1.5, None, 2**70, True, "a", [1], np.nan)
+BOTH = (-1, 2, 0.5, "one", None, np.nan, [1])
 SWITCH = (2, "no", None, 0.5, [True])
 SHARE = (0.0, 1.0, -0.1, 1.5, np.nan, "a", None, True)
 POSITIVE = (0.0, -1.0, np.nan, np.inf, "a", [1.0])
@@ -145,7 +146,7 @@ def of_model(layer, **options):
     """A layer in a model: layers are checked where they are placed."""
 
     def made(**arguments):
-        below = [dgp.Dynamic(pairs=1)] if layer is dgp.Static else []
+        below = [] if layer is dgp.Dynamic else [dgp.Dynamic(pairs=1)]
         return dgp.Cascade(1, [*below, layer(**{**options, **arguments})])
 
     return made
@@ -153,13 +154,15 @@ def of_model(layer, **options):
 
 TABLE: dict[str, Entry] = {
     "LinearDynamicGP": plain(dgp.LinearDynamicGP, {**LAYER, "noise": NAME, "brownian": COUNT,
-                             "feedthrough": SWITCH}, inputs=1, pairs=1),
+                             "feedthrough": SWITCH, "integrators": BOTH}, inputs=1, pairs=1),
     "Wiener": plain(dgp.Wiener, CURVED, inputs=1, pairs=1),
     "Hammerstein": plain(dgp.Hammerstein, CURVED, inputs=1, pairs=1),
     "WienerHammerstein": plain(dgp.WienerHammerstein, {**CURVED, "width": COUNT}, inputs=1,
                                pairs=1),
     "HammersteinWiener": plain(dgp.HammersteinWiener, CURVED, inputs=1, pairs=1),
     "NonlinearFeedback": plain(dgp.NonlinearFeedback, CURVED, inputs=1),
+    "ParallelWienerHammerstein": plain(dgp.ParallelWienerHammerstein,
+                                       {**CURVED, "branches": (*COUNT, None)}, inputs=1, pairs=1),
     "Cascade": plain(dgp.Cascade, {"inputs": NUMBER, "layers": ((), ["g"], [3], "g", None),
                      **OPTIONS}, inputs=1, layers=[dgp.Dynamic(pairs=1)]),
     "Model": plain(dgp.Model, {"inputs": NUMBER, "layers": ((), ("g",), (3,), "g", None), **OPTIONS,
@@ -167,18 +170,26 @@ TABLE: dict[str, Entry] = {
                    layers=(dgp.Dynamic(pairs=1),)),
     "Dynamic": plain(of_model(dgp.Dynamic, pairs=1), {
         "outputs": COUNT, "pairs": COUNT, "noise": NAME, "brownian": COUNT, "feedthrough": SWITCH,
-        "process_noise": SWITCH, "skip": (("g",), "inputs", 3), "feedback": (("f",), "f", 3),
+        "process_noise": SWITCH, "integrators": BOTH, "skip": (("g",), "inputs", 3),
+        "sees": (("g",), "inputs", 3), "feedback": (("f",), "f", 3),
         "name": ("y", "inputs", 3, "a b")}),
     "Static": plain(of_model(dgp.Static), {
         "outputs": COUNT, "inducing": COUNT, "kernel": KERNEL, "mean": NAME,
         "limits": ((1.0, 0.0), (None, None), (0.0,), 3, "ab", (np.nan, 1.0)),
-        "skip": (("x",), 3), "learn_locations": SWITCH, "support": COUNT, "name": ("y", 3)}),
+        "skip": (("x",), 3), "sees": (("x",), 3), "learn_locations": SWITCH,
+        "support": COUNT, "name": ("y", 3)}),
+    "Known": plain(of_model(dgp.Known, function=torch.sqrt), {
+        "function": (3, None, "text"), "parameters": (3, {"a": 3}, {3: None}), "outputs": COUNT,
+        "range": ((1.0, 0.0), 3, "text", (0.0, np.nan)), "skip": (("x",), 3),
+        "sees": (("x",), 3), "name": ("y", 3)}),
     "Gaussian": plain(dgp.Gaussian, {}),
     "StudentT": plain(dgp.StudentT, {"degrees_of_freedom": (0, -1.0, np.nan, np.inf, "a", None)}),
     "Heteroscedastic": plain(dgp.Heteroscedastic, {"inducing": COUNT, "of": NAME}),
     "TimeScale": plain(dgp.TimeScale, {"step": (*POSITIVE, None), "duration": (*POSITIVE, None)},
                        step=1.0, duration=100.0),
     "Mode": plain(dgp.Mode, {"optimizer": NAME}),
+    "Importance": plain(dgp.Importance, {"draws": (*COUNT, None), "longest": (*COUNT, None),
+                                         "optimizer": NAME}),
     "Normal": plain(dgp.Normal, {"family": (*NAME, None), **VARIATIONAL, "optimizer": NAME}),
     "Nuts": plain(dgp.Nuts, {"chains": COUNT, "warmup": COUNT, "draws": (*COUNT, 3),
                              "optimizer": NAME}),
@@ -292,10 +303,11 @@ TABLE: dict[str, Entry] = {
          "level": SHARE, "tries": (*COUNT, None), "effects": (3, ["a"], "a"), "settings": (3, {}),
          "workers": COUNT, "progress": SWITCH}, late=True),
     "Modes": plain(dgp.Modes, {
-        "poles": ([], ["a"], [1.0], [0.0], [np.nan], None, "text", 3.0),
+        "poles": ([], ["a"], [1.0], [np.nan], None, "text", 3.0),
         "input_gain": ([[1.0, 2.0], [1.0, 2.0]], "text", [np.nan], [["a"]]),
         "output_gain": ([1.0, 2.0], "text", [np.nan], None), "noise_gain": ([[1.0], [2.0]], "text"),
-        "feedthrough": ([1j], "text", [1.0, 2.0], [np.nan]), "noise": (*NAME, None)},
+        "feedthrough": ([1j], "text", [1.0, 2.0], [np.nan]),
+        "drift": ("text", [1.0, 2.0], [np.nan]), "noise": (*NAME, None)},
         poles=[-1.0 + 1j], input_gain=[[1.0]], output_gain=[1.0]),
     "sample_modes": plain(dgp.sample_modes, {
         "name": (3, None), "inputs": (*NUMBER, None), "pairs": (*COUNT, None), "outputs": COUNT,

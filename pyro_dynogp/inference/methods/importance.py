@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from pyro_dynogp.inference.fitted import Fitted
-from pyro_dynogp.inference.importance_sampling import sample_around
+from pyro_dynogp.inference.importance_sampling import sample_around, samples_of
 from pyro_dynogp.inference.methods.base import Problem
-from pyro_dynogp.inference.methods.mode import best_optima, check_optimizer
+from pyro_dynogp.inference.methods.mode import at_optimum, best_optima, check_optimizer
 from pyro_dynogp.inference.optimise.maximum import Optimizer, Optimum
 from pyro_dynogp.inference.pareto import good_k
 from pyro_dynogp.inference.posteriors import Sampled
@@ -15,6 +15,9 @@ from pyro_dynogp.inference.run import Run
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.support.errors import verify_fields, warn
 from pyro_dynogp.support.frozen import FrozenMapping
+
+# Samples of a record beyond which draws are not annealed by default.
+LONGEST = 1000
 
 
 @dataclass(frozen=True)
@@ -26,8 +29,12 @@ class Importance:
     static functions, they are annealed to it (`inference.importance_sampling`). Bands then know
     the uncertainty of every parameter, and each optimum has its posterior probability.
 
+    Annealing takes several times as long as the climbs, and matters less the longer a record is.
+    Along more than `longest` samples, where k asks for it, the fit is the posterior mode instead.
+
     Attributes:
         draws: posterior draws to keep, of equal weight.
+        longest: most samples along which draws are annealed.
         optimizer: for the climbs, as of `Mode`.
 
     Raises:
@@ -35,6 +42,7 @@ class Importance:
     """
 
     draws: int = 300
+    longest: int = LONGEST
     optimizer: Optimizer | None = None
 
     def __post_init__(self) -> None:
@@ -53,20 +61,27 @@ class Importance:
     def __call__(self, problem: Problem, run: Run) -> Fitted:
         """The draws, the mode and how it was found; steps of the run are those of each start."""
         optima = best_optima(problem, run, self.optimizer, run.steps)
-        return with_draws_around(problem, optima, run, self.draws)
+        return with_draws_around(problem, optima, run, self.draws, self.longest)
 
 
-def with_draws_around(problem: Problem, optima: list[Optimum], run: Run, draws: int) -> Fitted:
+def with_draws_around(
+    problem: Problem, optima: list[Optimum], run: Run, draws: int, longest: int = LONGEST
+) -> Fitted:
     """The fit that draws around several optima, the best first, are."""
     found = sample_around(
         problem.target,
         problem.records,
         [optimum.values for optimum in optima],
+        longest=longest,
         seed=run.seed,
         progress=run.progress,
     )
     good = good_k(len(found.draws))
-    if not found.annealed and not found.k <= good:
+    failed = not found.annealed and not found.k <= good
+    if failed and not problem.model.has_function and samples_of(problem.records) > longest:
+        mode = at_optimum(problem.model, optima, run.seed, problem.records)
+        return replace(mode, diagnostics=FrozenMapping({**mode.diagnostics, "pareto_k": found.k}))
+    if failed:
         warn(
             f"fit: Pareto's k of the posterior's draws is {found.k:.2f} (good: up to {good:.2f}): "
             "do not trust their weights, and bands made of them. Use method='nuts' or 'svi', or a "

@@ -15,7 +15,15 @@ from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.free_runs import free_run_error, noise_pays, silenced
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.optimise.gauss_newton import has_innovations
-from pyro_dynogp.inference.optimise.maximum import EFFORT, Effort, Optimizer, Optimum, maximise
+from pyro_dynogp.inference.optimise.maximum import (
+    EFFORT,
+    Effort,
+    Optimizer,
+    Optimum,
+    maximise,
+    optimizer_for,
+    optimizer_near,
+)
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.plans import (
@@ -24,8 +32,6 @@ from pyro_dynogp.inference.starts.plans import (
     Values,
     linear_starts,
     linear_twins,
-    optimizer_for,
-    optimizer_near,
     spread,
     starting_point,
 )

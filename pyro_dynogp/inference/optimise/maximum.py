@@ -15,9 +15,11 @@ from torch import Tensor
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.optimise import gauss_newton
 from pyro_dynogp.inference.optimise.descent import descend, lbfgs
+from pyro_dynogp.inference.optimise.gauss_newton import has_innovations
 from pyro_dynogp.inference.optimise.lockstep import Functions, in_lockstep
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.layers.sites import Program
+from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import Records, as_measured
 from pyro_dynogp.support.checkpoints import Piece, tensor_text, text_tensor
 from pyro_dynogp.support.parallel import parallel_map, seeded
@@ -295,3 +297,20 @@ def _stages(
     shares = [1.0, *(max(kept, share) for _, share in ranked)]
     counts = np.diff([0, *ends]).tolist()
     return [(count, share) for count, share in zip(counts, shares, strict=True) if count]
+
+
+def optimizer_for(model: Model) -> Optimizer:
+    """Gauss-Newton for linear models under Gaussian noise, Adam for functions, else L-BFGS.
+
+    Of models with functions Gauss-Newton finds higher modes, but with output scales and short
+    lengthscales that make the functions less certain than they are.
+    """
+    if model.has_function:
+        return "lbfgs" if model.has_feedback else "adam"
+    return "gauss-newton" if has_innovations(model) else "lbfgs"
+
+
+def optimizer_near(model: Model) -> Optimizer:
+    """The optimizer that goes on from near an optimum."""
+    near = has_innovations(model) and not model.has_function
+    return "gauss-newton" if near else "preconditioned"

@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.data.scaling import Scaling
-from pyro_dynogp.inference.optimise.gauss_newton import has_innovations
-from pyro_dynogp.inference.optimise.maximum import Optimizer, maximise
+from pyro_dynogp.inference.optimise.maximum import maximise, optimizer_for
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.dynamic import DynamicStart, Values
 from pyro_dynogp.inference.starts.poles import starting_values
@@ -317,20 +316,3 @@ def linear_starts(
     random = starting_values(model, records, count=count or RANDOM, seed=seed)
     both = [one for pair in zip_longest(subspace, random) for one in pair if one is not None]
     return both[:count]
-
-
-def optimizer_for(model: Model) -> Optimizer:
-    """Gauss-Newton for linear models under Gaussian noise, Adam for functions, else L-BFGS.
-
-    Of models with functions Gauss-Newton finds higher modes, but with output scales and short
-    lengthscales that make the functions less certain than they are.
-    """
-    if model.has_function:
-        return "lbfgs" if model.has_feedback else "adam"
-    return "gauss-newton" if has_innovations(model) else "lbfgs"
-
-
-def optimizer_near(model: Model) -> Optimizer:
-    """The optimizer that goes on from near an optimum."""
-    near = has_innovations(model) and not model.has_function
-    return "gauss-newton" if near else "preconditioned"
