@@ -99,7 +99,7 @@ class Modes:
             "feedthrough": D,
         }
         if self.drift is not None:
-            drift = as_tensor(self.drift, torch.complex128, poles.device)
+            drift = as_tensor(self.drift, torch.complex128, poles.device, argument="drift")
             fields["drift"] = self._gain("drift", drift.unsqueeze(-1), poles).squeeze(-1)
         # One number tells whether anything is not finite; which field it is, only an error asks.
         total = sum(value.detach().abs().sum() for value in fields.values())

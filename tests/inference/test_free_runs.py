@@ -11,7 +11,9 @@ import pyro_dynogp as dgp
 from pyro_dynogp.inference import free_runs
 from pyro_dynogp.inference.free_runs import free_run_error, noise_pays
 from pyro_dynogp.inference.methods import mode
+from pyro_dynogp.inference.optimise.maximum import Optimum
 from pyro_dynogp.inference.run import Run
+from pyro_dynogp.inference.starts.plans import starting_points
 from pyro_dynogp.models.outputs import output_process
 from tests.models.closed_loops import ClosedLoop, make_record, spring, system_at, values_of
 
@@ -140,3 +142,24 @@ def test_the_warning_is_of_the_line_that_called(monkeypatch):
         )  # fmt: skip
     said = [one for one in caught if "no better" in str(one.message)]
     assert [one.filename for one in said] == [__file__]
+
+
+def test_process_noise_begins_faint_after_climbs_without_any(monkeypatch):
+    model = dgp.Wiener(1, pairs=1).scaled_to(bent(60)).collapsed
+    ready = model.prepare(bent(60))
+    starts = starting_points(model, ready, Run(0, 1, False), count=2, steps=5)
+    given = []
+
+    def maximise(target, records, points, run, **options):
+        given.append(points)
+        return [Optimum(0.0, point, np.zeros(1), "") for point in points]
+
+    monkeypatch.setattr(mode, "maximise", maximise)
+    run = Run(0, 1, False)
+    mode.climb(model, ready, starts, [starts[0]], run, steps=10, optimizer="adam")
+    quiet, (learnt, noisy) = given
+    assert len(quiet) == 2
+    scale = "g_noise_gain_local_scale"
+    assert torch.equal(learnt[scale], starts[0][scale])  # what is learnt stays
+    assert torch.allclose(noisy[scale], mode.FAINT * starts[0][scale])
+    assert torch.equal(noisy["f_values"], quiet[0]["f_values"])

@@ -40,6 +40,8 @@ def values_of(model, record, seed=0, linear=True):
     values["noise_sd"] = values["noise_sd"].clamp(0.05, 1.0)
     values["g_input_gain"] = 0.4 * torch.tanh(values["g_input_gain"])
     if linear:
+        if "f_slope" in values:  # of several signals, whose loops explode where it is steep
+            values["f_slope"] = 0.3 * torch.tanh(values["f_slope"])
         values["f_values"] = torch.zeros_like(values["f_values"])
         if "f_half_width" in values:  # a line as far as any run goes
             values["f_half_width"] = torch.full_like(values["f_half_width"], 60.0)

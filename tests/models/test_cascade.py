@@ -116,7 +116,7 @@ def test_every_parameter_changes_the_collapsed_likelihood(name):
 
 @pytest.mark.parametrize("name", LARGE)
 def test_every_parameter_changes_signals_or_outputs(name):
-    model, record = case(name, n=12)
+    model, record = case(name, n=24)
     trace = draw(model, record, seed=3)
     values = parameters(model, trace)
     free = [one.name for one in model.wires if not (one.pathwise and isinstance(one.layer, Static))]
