@@ -152,7 +152,11 @@ def test_process_noise_begins_faint_after_climbs_without_any(monkeypatch):
 
     def maximise(target, records, points, run, **options):
         given.append(points)
-        return [Optimum(0.0, point, np.zeros(1), "") for point in points]
+        own = {site.name for site in target.all_sites(target.scaling, 1)}
+        return [
+            Optimum(0.0, {k: v for k, v in point.items() if k in own}, np.zeros(1), "")
+            for point in points
+        ]
 
     monkeypatch.setattr(mode, "maximise", maximise)
     run = Run(0, 1, False)
