@@ -151,14 +151,16 @@ def _final(
 ) -> list[Fit]:
     """Models of block A fitted to A and B, from what they have learnt.
 
-    Refits of the search are posterior modes; here the posterior is of the kind that the given fit
-    has, and at least that of static functions is wanted.
+    Models with functions have a fresh start, too, as in a first fit. Refits of the search are
+    posterior modes; here the posterior is of the kind that the given fit has, and at least that of
+    static functions is wanted.
     """
 
     def refitted(found: Fit) -> Fit:
         model = replace(found.model, scaling=None)
         return fit_model(
-            model, record, start=found, restarts=0, seed=found.seed, workers=1, progress=False,
+            model, record, start=found, restarts=int(model.has_function), seed=found.seed,
+            workers=1, progress=False,
             **_method_of(given, model),
         )  # fmt: skip
 

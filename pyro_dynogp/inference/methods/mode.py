@@ -145,12 +145,14 @@ def best_optima(
     """
     model, records, learnt = problem.model, problem.records, problem.learnt
     if learnt is not None and run.restarts == 0:
-        optimizer = optimizer or optimizer_near(model)
+        usual = optimizer_for if model.has_function else optimizer_near
+        optimizer = optimizer or usual(model)
         with seeded(run.seed):  # what has no typical value is drawn
             start = starting_point(model, records, Plan(None, None, False, run.seed))
         optima = maximise(
             problem.target, records, [grown(learnt, start)], run, optimizer=optimizer,
-            steps=steps or STEPS[optimizer], effort=Effort(near=True),
+            steps=steps or (FUNCTION_STEPS if model.has_function else STEPS)[optimizer],
+            effort=Effort(near=True),
         )  # fmt: skip
     elif model.is_linear:
         optimizer = optimizer or optimizer_for(model)
