@@ -234,7 +234,10 @@ def _check_known(name: str, layer: Known) -> None:
     instance(f"parameters of layer {name!r}", layer.parameters, Mapping)
     for parameter, prior in layer.parameters.items():
         instance(f"parameters of layer {name!r}: a name", parameter, str)
-        instance(f"parameters of layer {name!r}: {parameter}", prior, dist.Distribution)
+        if not isinstance(prior, dist.Distribution):
+            argument = f"parameters of layer {name!r}: {parameter}"
+            expected = "a distribution of pyro, of one number"
+            raise invalid(argument, expected=expected, got=repr(prior))
     ends = (0.0, 1.0) if layer.range is None else layer.range
     numbers = isinstance(ends, tuple | list) and all(isinstance(end, Real) for end in ends)
     if not (numbers and len(ends) == 2 and ends[0] < ends[1]):
