@@ -253,3 +253,27 @@ EDGE = 30.0
 def within_edges(z: Tensor) -> Tensor:
     """Unconstrained vectors, finite where values lie on a boundary."""
     return z.detach().nan_to_num(nan=math.nan, posinf=EDGE, neginf=-EDGE)
+
+
+def spread(values: Mapping[str, Tensor]) -> float:
+    """sqrt(d/2), the standard deviation of a d-dimensional normal's log density over its draws."""
+    return math.sqrt(0.5 * sum(value.numel() for value in values.values()))
+
+
+def heaviest(
+    evidence: Tensor, values: Mapping[str, Tensor], *, least: float, most: int
+) -> tuple[Tensor, Tensor]:
+    """Indices of the optima that carry weight, the weightiest first, and their weights.
+
+    Log densities of draws spread by sqrt(d/2) nats, so that an optimum's evidence says hardly more
+    than that about the mass around it: weights are exp(evidence / sqrt(d/2)), not exp(evidence),
+    which would keep one whatever the rest is.
+
+    Args:
+        evidence: (K,) Laplace's approximations of log p(y) around each [nats].
+        values: of all sites at one of them. least: weight that counts. most: how many are kept.
+    """
+    weights, order = torch.softmax(evidence / spread(values), 0).sort(descending=True)
+    order = order[weights >= least][:most]
+    weights = weights[: len(order)]
+    return order, weights / weights.sum()

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.inference.cascade_coordinates import StraightPotential
-from pyro_dynogp.inference.density import WALL, Potential
+from pyro_dynogp.inference.density import WALL, Potential, heaviest
 from pyro_dynogp.inference.log_joint import Direct
 from pyro_dynogp.inference.methods.annealed import (
     Annealed,
@@ -209,17 +209,13 @@ def weighed(potential: Potential, optima: Sequence[Values]) -> tuple[list[Values
     """Values at the optima that carry weight, the weightiest first, and their weights (K,).
 
     The highest optimum may be a needle: with few samples a system that passes through all of them.
-    What counts is the mass around each, by Laplace's approximation. Log densities of draws spread
-    by sqrt(d/2) nats, so that an evidence says hardly more than that about a mass: weights are
-    exp(evidence / sqrt(d/2)). The posterior probabilities are for the importance ratios to say.
+    What counts is the mass around each, by Laplace's approximation (`heaviest`). The posterior
+    probabilities are for the importance ratios to say.
     """
     different = distinct(potential, optima)
     evidence = torch.tensor([potential.log_evidence(one) for one in different], dtype=torch.float64)
-    temper = float(np.sqrt(0.5 * potential.size))
-    weights, order = torch.softmax(evidence / temper, 0).sort(descending=True)
-    order = order[weights >= LEAST_WEIGHT][:MOST_OPTIMA]
-    weights = weights[: len(order)]
-    return [different[index] for index in order], weights / weights.sum()
+    order, weights = heaviest(evidence, different[0], least=LEAST_WEIGHT, most=MOST_OPTIMA)
+    return [different[index] for index in order], weights
 
 
 def proposal_of(potential: Potential, optima: Sequence[Values], weights: Tensor) -> StudentMixture:

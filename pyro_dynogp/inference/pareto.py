@@ -1,4 +1,8 @@
-"""Pareto-smoothed importance sampling: weights of draws, and whether they are to be trusted."""
+"""Pareto-smoothed importance sampling: weights of draws, and whether they are to be trusted.
+
+Every default fit of a linear model asks for it, and ArviZ, to which it is equal in the tests, takes
+1.4 seconds to import: as long as the climb itself.
+"""
 
 from __future__ import annotations
 

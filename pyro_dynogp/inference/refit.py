@@ -18,7 +18,6 @@ from pyro_dynogp.inference.methods.mode import at_optimum, climb, louder
 from pyro_dynogp.inference.methods.nuts import sample_posterior
 from pyro_dynogp.inference.methods.optima import POLISH, Hyperparameters, posterior_of
 from pyro_dynogp.inference.methods.svi import Schedule
-from pyro_dynogp.inference.optimise.gauss_newton import has_innovations
 from pyro_dynogp.inference.optimise.maximum import Effort, Optimum, maximise, optimizer_near
 from pyro_dynogp.inference.posteriors import Mixture, Sampled, draws_of_guide
 from pyro_dynogp.inference.run import Run
@@ -102,7 +101,8 @@ def race(
 
     def after(steps: tuple[int, int], model: Model) -> Run:
         newton, other = steps
-        return replace(run, steps=newton if has_innovations(model) else other, workers=1)
+        quick = optimizer_near(model) == "gauss-newton"
+        return replace(run, steps=newton if quick else other, workers=1)
 
     for model in models:
         try:

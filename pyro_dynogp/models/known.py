@@ -20,6 +20,7 @@ from torch import Tensor
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.layers.functions import even_grid
 from pyro_dynogp.layers.sites import Site, Values
+from pyro_dynogp.models.layer import in_double
 from pyro_dynogp.models.structure import Structure
 from pyro_dynogp.models.wiring import INPUTS, Known, Wire
 from pyro_dynogp.moments.functions import gauss_hermite
@@ -110,7 +111,7 @@ class KnownFunction:
 def known_sites(name: str, layer: Known) -> tuple[Site, ...]:
     """Sites of a known function's parameters."""
     return tuple(
-        Site(f"{name}_{parameter}", _in_double(prior, f"parameters[{parameter!r}]"), (), "free")
+        Site(f"{name}_{parameter}", in_double(prior, f"parameters[{parameter!r}]"), (), "free")
         for parameter, prior in layer.parameters.items()
     )
 
@@ -177,23 +178,6 @@ def _standard(f: KnownFunction) -> tuple[Tensor, Tensor]:
             advice="Inputs and the measured output are in units of the record.",
         )
     return mean, sd
-
-
-def _in_double(prior: dist.Distribution, what: str) -> dist.Distribution:
-    """The prior of one number, in float64."""
-    expected = "a distribution of pyro, of one number"
-    if (
-        not isinstance(prior, torch.distributions.Distribution)
-        or prior.batch_shape + prior.event_shape
-    ):
-        raise invalid(what, expected=expected, got=repr(prior))
-    given = {name: getattr(prior, name, None) for name in prior.arg_constraints}
-    try:
-        kind: Callable[..., dist.Distribution] = type(prior)
-        return kind(**{name: x.double() for name, x in given.items() if isinstance(x, Tensor)})
-    except TypeError:
-        expected += " that is made from its parameters alone"
-        raise invalid(what, expected=expected, got=repr(prior)) from None
 
 
 def middle_of(site: Site) -> Tensor:

@@ -7,10 +7,12 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 import pyro.distributions as dist
+import torch
 from gpytorch.kernels import Kernel
 from torch import Tensor
 
 from pyro_dynogp.lti.modes import NoiseStructure
+from pyro_dynogp.support.errors import invalid
 
 # Lowest and highest value, None where there is none.
 Limits = tuple[float | None, float | None]
@@ -130,3 +132,27 @@ class Known:
 
 StaticLayer = Static | Known
 Layer = Dynamic | StaticLayer
+
+
+def in_double(prior: dist.Distribution, what: str) -> dist.Distribution:
+    """The prior of one number, in float64.
+
+    Args:
+        prior: of a parameter of `Known`. what: to call it in errors.
+
+    Raises:
+        ValueError: where it is none, or cannot be made anew from its parameters.
+    """
+    expected = "a distribution of pyro, of one number"
+    if (
+        not isinstance(prior, torch.distributions.Distribution)
+        or prior.batch_shape + prior.event_shape
+    ):
+        raise invalid(what, expected=expected, got=repr(prior))
+    given = {name: getattr(prior, name, None) for name in prior.arg_constraints}
+    try:
+        kind: Callable[..., dist.Distribution] = type(prior)
+        return kind(**{name: x.double() for name, x in given.items() if isinstance(x, Tensor)})
+    except TypeError:
+        expected += " that is made from its parameters alone"
+        raise invalid(what, expected=expected, got=repr(prior)) from None

@@ -7,8 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from numbers import Real
 
-import pyro.distributions as dist
-
 from pyro_dynogp.layers.kernels import KernelPrior
 from pyro_dynogp.models.layer import Dynamic as Dynamic
 from pyro_dynogp.models.layer import Known as Known
@@ -16,6 +14,7 @@ from pyro_dynogp.models.layer import Layer as Layer
 from pyro_dynogp.models.layer import Limits as Limits
 from pyro_dynogp.models.layer import Static as Static
 from pyro_dynogp.models.layer import StaticLayer as StaticLayer
+from pyro_dynogp.models.layer import in_double
 from pyro_dynogp.support.errors import COUNT, RULES, instance, invalid
 
 INPUTS = "inputs"
@@ -234,10 +233,7 @@ def _check_known(name: str, layer: Known) -> None:
     instance(f"parameters of layer {name!r}", layer.parameters, Mapping)
     for parameter, prior in layer.parameters.items():
         instance(f"parameters of layer {name!r}: a name", parameter, str)
-        if not isinstance(prior, dist.Distribution):
-            argument = f"parameters of layer {name!r}: {parameter}"
-            expected = "a distribution of pyro, of one number"
-            raise invalid(argument, expected=expected, got=repr(prior))
+        in_double(prior, f"parameters of layer {name!r}: {parameter}")
     ends = (0.0, 1.0) if layer.range is None else layer.range
     numbers = isinstance(ends, tuple | list) and all(isinstance(end, Real) for end in ends)
     if not (numbers and len(ends) == 2 and ends[0] < ends[1]):

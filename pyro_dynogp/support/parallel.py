@@ -28,7 +28,8 @@ from pyro_dynogp.support.errors import verify
 # How often work is begun of which processes were killed.
 ATTEMPTS = 3
 # Threads of one process take turns: random numbers, Pyro's handlers and the number of threads are
-# the process's. Held only while a piece of work runs.
+# the process's. Held only while a piece of work runs, and another lock than that of
+# `inference.isolation`: whoever hands out the work holds that one meanwhile.
 _TURN = threading.RLock()
 Item = TypeVar("Item")
 Result = TypeVar("Result")

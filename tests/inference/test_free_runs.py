@@ -31,7 +31,7 @@ def chosen(monkeypatch, *attempts, model=None):
     twin = (dgp.LinearDynamicGP(1), [], [LINE])
     left = list(attempts)
     monkeypatch.setattr(mode, "linear_twins", lambda *_: {"g": twin})
-    monkeypatch.setattr(mode, "spread", lambda *_: [{}])
+    monkeypatch.setattr(mode, "starts_of", lambda *_: [{}])
     monkeypatch.setattr(mode, "free_run_error", lambda model, values, records: values)
     monkeypatch.setattr(mode, "climb", lambda *_, **__: [optimum(*one) for one in left.pop(0)])
     found = mode.cascade_optima(problem, Run(0, 1, False), "adam", 10)

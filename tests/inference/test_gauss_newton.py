@@ -15,7 +15,7 @@ from pyro_dynogp.inference.optimise.gauss_newton import (
     climb,
     has_innovations,
 )
-from pyro_dynogp.inference.optimise.maximum import maximise
+from pyro_dynogp.inference.optimise.maximum import maximise, optimizer_for, optimizer_near
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.plans import linear_starts, starting_points
 from pyro_dynogp.inference.starts.poles import starting_values
@@ -180,6 +180,14 @@ def test_which_models_have_innovations():
     assert not has_innovations(dgp.Cascade(1, (dgp.Dynamic(), limited)))
     assert not has_innovations(dgp.Cascade(1, (dgp.Dynamic(),), dgp.StudentT()))
     assert not has_innovations(lambda: None)
+
+
+def test_which_optimizer_climbs():
+    two = dgp.Cascade(1, (dgp.Dynamic(), dgp.Dynamic()))
+    models = Linear(1), dgp.Wiener(1), dgp.NonlinearFeedback(1), two
+    assert [optimizer_for(m) for m in models] == ["gauss-newton", "adam", "lbfgs", "lbfgs"]
+    assert [optimizer_near(m) for m in models] == ["gauss-newton", *["preconditioned"] * 3]
+    assert optimizer_for(Linear(1, likelihood=dgp.StudentT())) == "lbfgs"
 
 
 def test_is_refused_where_there_are_none(record):

@@ -1,14 +1,17 @@
 """Fits made again on other data: same scaling and family, near the old optimum, refusals."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 import pyro_dynogp as dgp
+from pyro_dynogp.inference import refit as refits
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.refit import optima_of, refit
+from pyro_dynogp.inference.run import Run
 from tests.inference.cascades import FAST, wiener
 
 
@@ -66,3 +69,19 @@ def test_the_mode_of_a_fit(map_fit, svi_fit, layered_fit):
     # The middle of a posterior with trajectories as sites is another number than a mode.
     with pytest.raises(ValueError, match="fit: expected a fit whose trajectories are integrated"):
         layered_fit.at_mode()
+
+
+@pytest.mark.parametrize(
+    ("model", "steps"),
+    [(dgp.LinearDynamicGP(1), [2, 2, 2, 2, 12, 12, 12]), (dgp.Wiener(1), [8, 8, 8, 8, 32, 32, 32])],
+)
+def test_races_count_the_steps_of_the_optimizer_that_runs(monkeypatch, model, steps):
+    given = []
+
+    def again(fit, records, *, run, model=None):
+        given.append(run.steps)
+        return SimpleNamespace(model=model or fit.model, records=records, start_energies=[0.0])
+
+    monkeypatch.setattr(refits, "refit", again)
+    refits.race(SimpleNamespace(model=model), [model] * 4, None, Run(0))
+    assert given == steps

@@ -32,8 +32,8 @@ from pyro_dynogp.inference.starts.plans import (
     Values,
     linear_starts,
     linear_twins,
-    spread,
     starting_point,
+    starts_of,
 )
 from pyro_dynogp.inference.starts.poles import grown
 from pyro_dynogp.layers.noise import TYPICAL
@@ -187,7 +187,7 @@ def cascade_optima(problem: Problem, run: Run, optimizer: Optimizer, steps: int)
         twins = linear_twins(model, records, again, steps)
         lines = [t for t in twins.values() if model.has_function and t[0].outputs == model.outputs]
         least = min([least, *(free_run_error(one, at[0], own) for one, own, at in lines)])
-        starts = spread(model, records, twins, run.restarts or usual, again.seed)
+        starts = starts_of(model, records, twins, run.restarts or usual, again.seed)
         warm = [] if learnt is None else [grown(learnt, starts[0])]
         optima += climb(
             model, records, starts, warm, again, steps=steps, optimizer=optimizer,

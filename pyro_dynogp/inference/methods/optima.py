@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
@@ -12,7 +11,7 @@ import pyro
 import torch
 from torch import Tensor
 
-from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.density import Potential, heaviest
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.mode import best_optima, check_optimizer
@@ -181,10 +180,7 @@ def posterior_of(
 
     With "map" inducing values and first states have multivariate normals and everything else stays
     at the optimum, at up to `MOST_OPTIMA` of them: such a posterior has many modes, and no normal
-    spans two. Log densities of draws from a d-dimensional posterior spread by sqrt(d/2) nats, so an
-    optimum's evidence, found by Laplace's approximation for all sites, says hardly more than that
-    about the mass around it. The weights of the optima are therefore exp(evidence / sqrt(d/2)), not
-    exp(evidence), which would keep one whatever the rest is.
+    spans two. Their weights are those of `heaviest`, by Laplace's approximation for all sites.
 
     Args:
         problem: model and records. optima: the best first. family: of the posterior.
@@ -244,14 +240,8 @@ def _weighted(problem: Problem, optima: Sequence[Optimum], run: Run) -> tuple[li
         news=lambda done: f"log evidence {max(done):.2f}",
     )
     levels = torch.tensor(evidences, dtype=torch.float64)
-    weights, order = torch.softmax(levels / spread(leading[0]), 0).sort(descending=True)
-    heavy = weights >= LEAST_WEIGHT
-    return [leading[index] for index in order[heavy]], weights[heavy] / weights[heavy].sum()
-
-
-def spread(values: Mapping[str, Tensor]) -> float:
-    """sqrt(d/2), the standard deviation of a d-dimensional normal's log density over its draws."""
-    return math.sqrt(0.5 * sum(value.numel() for value in values.values()))
+    order, weights = heaviest(levels, leading[0], least=LEAST_WEIGHT, most=MOST_OPTIMA)
+    return [leading[index] for index in order], weights
 
 
 def level(found: VariationalPosterior) -> float:

@@ -305,12 +305,11 @@ def optimizer_for(model: Model) -> Optimizer:
     Of models with functions Gauss-Newton finds higher modes, but with output scales and short
     lengthscales that make the functions less certain than they are.
     """
-    if model.has_function:
-        return "lbfgs" if model.has_feedback else "adam"
-    return "gauss-newton" if has_innovations(model) else "lbfgs"
+    if model.is_linear and has_innovations(model):
+        return "gauss-newton"
+    return "adam" if model.has_function and not model.has_feedback else "lbfgs"
 
 
 def optimizer_near(model: Model) -> Optimizer:
     """The optimizer that goes on from near an optimum."""
-    near = has_innovations(model) and not model.has_function
-    return "gauss-newton" if near else "preconditioned"
+    return "gauss-newton" if model.is_linear and has_innovations(model) else "preconditioned"

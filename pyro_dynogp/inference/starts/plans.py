@@ -260,10 +260,10 @@ def starting_points(
     model: Model, records: Sequence[PreparedRecord], run: Run, *, count: int, steps: int
 ) -> list[Values]:
     """Values of every site for each restart, from the optima of linear fits."""
-    return spread(model, records, linear_twins(model, records, run, steps), count, run.seed)
+    return starts_of(model, records, linear_twins(model, records, run, steps), count, run.seed)
 
 
-def spread(
+def starts_of(
     model: Model,
     records: Sequence[PreparedRecord],
     twins: Mapping[str, Twin],
