@@ -56,6 +56,15 @@ class Dynamic:
         """Number of poles that stand for pairs: an integrator counts, and its random walk."""
         return self.pairs + self.integrators * self.outputs * (2 if self.process_noise else 1)
 
+    @property
+    def past_states(self) -> tuple[int, ...]:
+        """Entries of [Re x; Im x] that inputs before a record can have moved.
+
+        That of an integrator is real, and its random walk has no input.
+        """
+        real = self.pairs + self.integrators * self.outputs
+        return (*range(real), *range(self.modes, self.modes + self.pairs))
+
 
 @dataclass(frozen=True)
 class Static:

@@ -52,10 +52,10 @@ class Model(Structure):
         likelihood: `Gaussian()`, `StudentT(...)` or `Heteroscedastic(...)`.
         initial_state: what past inputs left in a dynamic layer at the first sample. "auto": in a
             layer that a static layer sees it is a site, ``g_initial_state`` (2P,), standard
-            normal; in other layers it is integrated out. "site": a site in every layer.
-            "integrated": everywhere (below a static layer moment matching is then poor at the
-            beginning of a record: the state is too uncertain for it). "zero": nothing is left. Past
-            process noise is always there.
+            normal (of an integrator one number); in other layers it is integrated out. "site": a
+            site in every layer. "integrated": everywhere (below a static layer moment matching is
+            then poor at the beginning of a record: the state is too uncertain for it). "zero":
+            nothing is left. Past process noise is always there.
         integrate: "none" keeps every trajectory as a site; "last" integrates a dynamic last layer
             under Gaussian noise, exactly; "all" integrates all trajectories, exactly where they are
             linear, else by the moment-matching filter.
@@ -115,7 +115,7 @@ class Model(Structure):
         sites = []
         for w, layer in self.dynamic:
             if w in self.state_sites:
-                zero = torch.zeros(2 * layer.modes, dtype=torch.float64)
+                zero = torch.zeros(len(layer.past_states), dtype=torch.float64)
                 prior = dist.Normal(zero, zero + 1.0).to_event(1)
                 name, dims = f"{w.name}_initial_state{suffix}", (w.dims["state"],)
                 sites.append(Site(name, prior, dims, role="free", growth=0.0))
@@ -246,7 +246,11 @@ class Model(Structure):
 
     def states_of(self, values: Mapping[str, Tensor], suffix: str) -> dict[str, Tensor]:
         """Standard normal numbers (*b, 2P) behind the first state of a record, by layer."""
-        return {w.name: values[f"{w.name}_initial_state{suffix}"] for w in self.state_sites}
+        layers = dict(self.dynamic)
+        return {
+            w.name: _placed(values[f"{w.name}_initial_state{suffix}"], layers[w])
+            for w in self.state_sites
+        }
 
     def begin(self, system: System, states: Mapping[str, Tensor]) -> System:
         """The system at the beginning of a record, as `initial_state` has it."""
@@ -257,3 +261,11 @@ class Model(Structure):
             }
             return system.after(zeros)
         return system.after(states)
+
+
+def _placed(standard: Tensor, layer: Dynamic) -> Tensor:
+    """Numbers of the states that past inputs moved among those of all (*b, 2P), others zero."""
+    if len(layer.past_states) == 2 * layer.modes:
+        return standard
+    whole = standard.new_zeros((*standard.shape[:-1], 2 * layer.modes))
+    return whole.index_copy(-1, torch.tensor(layer.past_states), standard)

@@ -50,8 +50,7 @@ def values_of(model, record, seed=0, linear=True):
 
 
 def system_at(model, values):
-    states = {w.name: values[f"{w.name}_initial_state"] for w in model.state_sites}
-    return model.begin(model.system(values, model.scaling), states)
+    return model.begin(model.system(values, model.scaling), model.states_of(values, ""))
 
 
 def plain_loop(model, system, record, slope=0.0, constant=0.0):

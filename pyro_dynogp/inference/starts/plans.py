@@ -190,7 +190,7 @@ def starting_point(model: Model, records: Sequence[PreparedRecord], plan: Plan) 
         suffix = "" if len(records) == 1 else f"_{index}"
         for one in model.state_sites:
             assert isinstance(one.layer, Dynamic)
-            state = torch.zeros(2 * one.layer.modes, dtype=torch.float64)
+            state = torch.zeros(len(one.layer.past_states), dtype=torch.float64)
             if one.name == plan.leading and plan.linear is not None:
                 state = _linear_state(model, one, record, plan.linear)
             values[f"{one.name}_initial_state{suffix}"] = state
@@ -223,11 +223,11 @@ def _linear_state(
     record: PreparedRecord,
     linear: Mapping[str, Tensor],
 ) -> Tensor:
-    """Standard normal numbers (2P,) of the first state that the linear fit finds by smoothing."""
+    """Standard normal numbers of the first state that the linear fit finds by smoothing."""
     layer = one.layer
     assert isinstance(layer, Dynamic)
     if layer.outputs != model.outputs or not one.channels:
-        return torch.zeros(2 * layer.modes, dtype=torch.float64)
+        return torch.zeros(len(layer.past_states), dtype=torch.float64)
     noisy = "g_noise_gain_unit" in linear
     alone = (replace(layer, feedback=(), process_noise=noisy),)
     twin = Model(
@@ -253,7 +253,7 @@ def _linear_state(
         left = past @ torch.linalg.solve(whole + ridge, torch.tensor(first[:J]))
         root = torch.linalg.cholesky(past + 1e-9 * past.diagonal().mean() * eye)
         state = torch.linalg.solve_triangular(root, left.unsqueeze(-1), upper=False).squeeze(-1)
-    return state.clamp(-3.0, 3.0)
+    return state.clamp(-3.0, 3.0)[list(alone[0].past_states)]
 
 
 def starting_points(
