@@ -23,7 +23,7 @@ from pyro_dynogp.inference.posteriors import Mixture, Sampled, draws_of_guide
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.dynamic import Values
 from pyro_dynogp.inference.starts.extended import extended_starts
-from pyro_dynogp.inference.starts.plans import linear_starts
+from pyro_dynogp.inference.starts.plans import linear_starts, starting_points
 from pyro_dynogp.inference.starts.poles import grown
 from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
 from pyro_dynogp.models.model import Model
@@ -36,6 +36,9 @@ from pyro_dynogp.support.parallel import seeded
 SAME_STEPS, ADAM_STEPS, SVI_STEPS = 300, 200, 400
 # Iterations of extended models: linear, others of the same layers, with a layer more.
 LINEAR_STEPS, LAYERED_STEPS, ADDED_STEPS = 100, 100, 300
+# Starts from linear fits of its own that a model with a layer more has beside what is learnt, and
+# iterations of those fits.
+FRESH, FRESH_STEPS = 4, 40
 # Of the same model every start goes on, near its optimum; of a linear one that is extended half of
 # them do, side by side, as processors are kept busy by other trials.
 AGAIN = Effort(kept=1.0, rate=0.004, near=True)
@@ -163,7 +166,9 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
 
     With a layer more Adam climbs, as in a first fit: better optimisers get to modes of a free
     function that fit the noise (one that is flat where outputs repeat) and of which its special
-    cases have none, so that gains would be those of climbs.
+    cases have none, so that gains would be those of climbs. Where the function is far from a line
+    (a sensor that reports a size) the linear fit is any of several poor optima: such a model starts
+    from linear fits of its own, too.
 
     A linear model with more pairs has the starts of a first fit, too: what is new may take the
     place of what is learnt.
@@ -187,6 +192,8 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
         fresh = linear_starts(target, records, None, run.seed) if more else []
         return climbed(target, [*fresh, *starts], LINEAR_STEPS)
     if len(target.layers) > len(fit.model.layers):
+        if not run.steps:
+            starts += starting_points(target, records, run, count=FRESH, steps=FRESH_STEPS)
         return climb(target, records, starts, [], run, steps=run.steps or ADDED_STEPS,
                      optimizer="adam", effort=EXTENDED)  # fmt: skip
     quiet = without_noise_below_functions(target)

@@ -151,17 +151,17 @@ def _final(
 ) -> list[Fit]:
     """Models of block A fitted to A and B, from what they have learnt.
 
-    Models with functions have a fresh start, too, as in a first fit. Refits of the search are
-    posterior modes; here the posterior is of the kind that the given fit has, and at least that of
-    static functions is wanted.
+    They have fresh starts, too, models with functions one, linear ones as many as in a first fit:
+    an optimum of less data may be a poor one of more, and errors before would be too large. Refits
+    of the search are posterior modes; here the posterior is of the kind that the given fit has, and
+    at least that of static functions is wanted.
     """
 
     def refitted(found: Fit) -> Fit:
         model = replace(found.model, scaling=None)
         return fit_model(
-            model, record, start=found, restarts=int(model.has_function), seed=found.seed,
-            workers=1, progress=False,
-            **_method_of(given, model),
+            model, record, start=found, restarts=1 if model.has_function else None,
+            seed=found.seed, workers=1, progress=False, **_method_of(given, model),
         )  # fmt: skip
 
     return parallel_map(refitted, fits, workers=workers, progress=progress, description="last fits")

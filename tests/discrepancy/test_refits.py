@@ -120,6 +120,17 @@ def test_a_function_more_is_climbed_by_adam_from_what_is_learnt(monkeypatch, rec
     assert (optimizer, len(starts)) == ("adam", 2)
 
 
+def test_a_function_more_is_climbed_from_linear_fits_of_its_own_too():
+    """The sensor reports a size: the optimum of the linear model leads nowhere."""
+    record = dgp.datasets.load("coupled_drives", record=1).train[:260]
+    linear = dgp.LinearDynamicGP(1, pairs=3, process_noise=False)
+    model = dgp.Cascade(1, (dgp.Dynamic(pairs=3, process_noise=False), dgp.Static()))
+    base = dgp.fit(linear, record, method="map", workers=1, progress=False)
+    first = dgp.fit(model, record, method="map", restarts=4, workers=1, progress=False)
+    # Of what the base has learnt alone: some 150 nats less.
+    assert energy(refit(base, record, model=model, run=RUN)) < energy(first) + 100.0
+
+
 def test_what_cannot_be_fitted_is_said(record, base):
     still = with_channel(MODEL, Recorded("still"))
     found, (problem,) = race(base, [still, later(LATE)], record, RUN)
