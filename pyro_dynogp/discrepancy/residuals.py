@@ -76,6 +76,7 @@ def residuals_of(
         mean=mean,
         deviations=deviations - deviations.mean(0),
         innovations=innovations,
+        poles=poles_of(fit),
         inputs=prepared.inputs[:, :driving],
         input_names=prepared.input_names[:driving],
         candidates={name: record.extra[name] for name in candidates},
@@ -90,9 +91,15 @@ def residuals_of(
 
 def settling(fit: Fit, record: Record, settings: LoopSettings) -> int:
     """Samples until what the first state left in a simulation has died away."""
-    modes = [layer.modes for _, layer in fit.system_at(fit.mode).dynamic]
-    if not modes:
+    poles = poles_of(fit)
+    if not len(poles):
         return 0
-    slowest = min(float(-one.poles.real.max()) for one in modes)
+    slowest = float(-poles.real.max())
     count = settings.settled / max(slowest * record.sampling_time, 1e-9)
     return int(min(count, settings.settling_share * len(record)))
+
+
+def poles_of(fit: Fit) -> np.ndarray:
+    """Poles (P,) of all dynamic layers at the mode, one of each conjugate pair [1 / time unit]."""
+    found = [layer.modes.poles.numpy() for _, layer in fit.system_at(fit.mode).dynamic]
+    return np.concatenate(found) if found else np.zeros(0, dtype=complex)

@@ -20,6 +20,7 @@ from pyro_dynogp.effects.heteroscedastic import HeteroscedasticNoise
 from pyro_dynogp.effects.hysteresis import Hysteresis
 from pyro_dynogp.effects.input_nonlinearity import InputNonlinearity
 from pyro_dynogp.effects.level_shift import LevelShift
+from pyro_dynogp.effects.nonlinear_feedback import NonlinearFeedbackOfOutput
 from pyro_dynogp.effects.output_nonlinearity import OutputNonlinearity
 from pyro_dynogp.effects.periodic import PeriodicDisturbance
 from pyro_dynogp.effects.process_noise import ProcessNoise
@@ -29,7 +30,7 @@ __all__ = ["CATALOGUE", "Effect"]
 
 CATALOGUE: tuple[Effect, ...] = (
     ExtraInput(), DeadTime(), UnmodelledDynamics(), OutputNonlinearity(), InputNonlinearity(),
-    Saturation(), DeadZoneOfInput(), Hysteresis(), Drift(), LevelShift(), PeriodicDisturbance(),
-    CalendarEffect(), ClockShift(), HeavyTails(), HeteroscedasticNoise(), ProcessNoise(),
-    Feedback(),
+    NonlinearFeedbackOfOutput(), Saturation(), DeadZoneOfInput(), Hysteresis(), Drift(),
+    LevelShift(), PeriodicDisturbance(), CalendarEffect(), ClockShift(), HeavyTails(),
+    HeteroscedasticNoise(), ProcessNoise(), Feedback(),
 )  # fmt: skip

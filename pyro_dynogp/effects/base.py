@@ -108,6 +108,14 @@ class Effect:
         """What it is, once the model has it; what the test said by default."""
         return evidence.sentence
 
+    def shape(self, parameters: Parameters) -> str:
+        """What its numbers come to, in a sentence of its own that follows; "" for nothing.
+
+        Args:
+            parameters: of its channels, and those that the effect adds.
+        """
+        return ""
+
     def parameters(self, fit: Fit, evidence: Evidence, record: Record) -> Parameters:
         """Posterior mean and standard deviation of numbers that are not those of its channels.
 

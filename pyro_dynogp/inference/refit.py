@@ -18,7 +18,13 @@ from pyro_dynogp.inference.methods.mode import at_optimum, climb, louder
 from pyro_dynogp.inference.methods.nuts import sample_posterior
 from pyro_dynogp.inference.methods.optima import POLISH, Hyperparameters, posterior_of
 from pyro_dynogp.inference.methods.svi import Schedule
-from pyro_dynogp.inference.optimise.maximum import Effort, Optimum, maximise, optimizer_near
+from pyro_dynogp.inference.optimise.maximum import (
+    Effort,
+    Optimum,
+    maximise,
+    optimizer_for,
+    optimizer_near,
+)
 from pyro_dynogp.inference.posteriors import Mixture, Sampled, draws_of_guide
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.dynamic import Values
@@ -164,11 +170,12 @@ def _again(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
 def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     """Optima of a model that extends that of a fit.
 
-    With a layer more Adam climbs, as in a first fit: better optimisers get to modes of a free
-    function that fit the noise (one that is flat where outputs repeat) and of which its special
-    cases have none, so that gains would be those of climbs. Where the function is far from a line
-    (a sensor that reports a size) the linear fit is any of several poor optima: such a model starts
-    from linear fits of its own, too.
+    With a layer more Adam climbs (L-BFGS with feedback), as in a first fit: better optimisers get
+    to modes of a free function that fit the noise (one that is flat where outputs repeat) and of
+    which its special cases have none, so that gains would be those of climbs. Where the function
+    is far from a line (a sensor that reports a size) the linear fit is any of several poor optima:
+    such a model starts from linear fits of its own, too; a function in feedback from what is
+    learnt, where nothing comes back as yet.
 
     A linear model with more pairs has the starts of a first fit, too: what is new may take the
     place of what is learnt.
@@ -192,10 +199,10 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
         fresh = linear_starts(target, records, None, run.seed) if more else []
         return climbed(target, [*fresh, *starts], LINEAR_STEPS)
     if len(target.layers) > len(fit.model.layers):
-        if not run.steps:
+        if not (run.steps or target.has_feedback):
             starts += starting_points(target, records, run, count=FRESH, steps=FRESH_STEPS)
         return climb(target, records, starts, [], run, steps=run.steps or ADDED_STEPS,
-                     optimizer="adam", effort=EXTENDED)  # fmt: skip
+                     optimizer=optimizer_for(target), effort=EXTENDED)  # fmt: skip
     quiet = without_noise_below_functions(target)
     if quiet != target:
         best = climbed(quiet, [louder(start) for start in starts], LAYERED_STEPS)[0]

@@ -12,6 +12,8 @@ from pyro_dynogp.models.wiring import Dynamic, Limits, Static, StaticLayer, Wire
 
 # Inducing values of a function that is added.
 INDUCING = 32
+# Name of the function that acts back.
+FEEDBACK = "feedback"
 
 
 def with_channel(model: Model, channel: Channel) -> Model:
@@ -101,6 +103,25 @@ def with_input_function(model: Model) -> Model | None:
         return None
     first = Static(outputs=driving, inducing=INDUCING)
     return replace(model, layers=(first, *model.layers), scaling=None, output=None)
+
+
+def with_output_feedback(model: Model) -> Model | None:
+    """The model with a static layer that sees its output and acts back on its last dynamic layer.
+
+    None where there is feedback already, where another layer comes last, and under noise that
+    feedback does not allow.
+    """
+    *rest, last = model.layers
+    varying = model.likelihood.varying and model.likelihood.of == "output"
+    heavy = model.likelihood.degrees_of_freedom is not None
+    if not isinstance(last, Dynamic) or model.has_feedback or varying or heavy:
+        return None
+    looped = replace(last, feedback=(*last.feedback, FEEDBACK))
+    back = Static(outputs=model.outputs, inducing=INDUCING, name=FEEDBACK)
+    output = model.output_wire.name
+    return replace(
+        model, layers=(*rest, looped, back), scaling=None, output=output, integrate="all"
+    )
 
 
 def with_likelihood(model: Model, likelihood: Likelihood) -> Model:

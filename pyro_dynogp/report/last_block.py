@@ -156,9 +156,10 @@ def _effect(
     parts = [in_words(one) for one in own] or describe(confirmed.model)
     parameters = parameters_of(extended, own, record)
     parameters |= found.effect.parameters(extended, found.evidence, record)
+    sentence = found.effect.sentence(found.evidence, confirmed.model)
     return FoundEffect(
         name=found.effect.name,
-        sentence=found.effect.sentence(found.evidence, confirmed.model),
+        sentence=f"{sentence} {found.effect.shape(parameters)}".rstrip(),
         p_value=found.evidence.p_value,
         q_value=found.q_value,
         gain=attempt.gain,

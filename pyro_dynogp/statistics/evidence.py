@@ -20,6 +20,8 @@ class Residuals:
         deviations: (S, n) simulated means of posterior draws less `mean` [output]: what the
             uncertainty of the parameters leaves.
         innovations: (n,) standardised one-step prediction errors, NaN where missing.
+        poles: (P,) complex, of the model's dynamic layers, one of each conjugate pair [1 / time
+            unit].
         inputs: (n, n_u) that the model uses. input_names: of them.
         candidates: (n,) recorded channels that it does not use, by name; NaN where missing.
         held_out: (n,) True where neither fit nor scaling has seen the output.
@@ -32,6 +34,7 @@ class Residuals:
     mean: np.ndarray
     deviations: np.ndarray
     innovations: np.ndarray
+    poles: np.ndarray
     inputs: np.ndarray
     input_names: tuple[str, ...]
     candidates: Mapping[str, np.ndarray]

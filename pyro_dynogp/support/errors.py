@@ -176,8 +176,10 @@ def checked(function: Callable[Given, Result]) -> Callable[Given, Result]:
 
 
 def warn(message: str) -> None:
-    """Warn of the line that called the package."""
-    frame, level = inspect.currentframe(), 1
-    while frame is not None and str(frame.f_globals.get("__name__")).startswith("pyro_dynogp"):
+    """Warn of the line that called the package, also through other libraries that it calls."""
+    frame, level, caller = inspect.currentframe(), 1, 1
+    while frame is not None:
+        if str(frame.f_globals.get("__name__")).startswith("pyro_dynogp"):
+            caller = level + 1
         frame, level = frame.f_back, level + 1
-    warnings.warn(message, stacklevel=level)
+    warnings.warn(message, stacklevel=caller)

@@ -27,7 +27,17 @@ def lag(u, tau, step=0.1, gain=1.0):
 
 
 def residuals_of(
-    output, mean, inputs, candidates=None, *, step=0.1, seed=0, names=None, time=None, drawn=0.02
+    output,
+    mean,
+    inputs,
+    candidates=None,
+    *,
+    step=0.1,
+    seed=0,
+    names=None,
+    time=None,
+    drawn=0.02,
+    poles=None,
 ):
     """What a detector gets; draws of the parameters differ in the gain of the mean."""
     rng = np.random.default_rng(seed + 1000)
@@ -41,6 +51,7 @@ def residuals_of(
         mean=mean,
         deviations=drawn * rng.standard_normal((20, 1)) * np.std(e) / np.std(mean) * mean,
         innovations=innovations / np.nanstd(innovations),
+        poles=np.array([-2.0 + 1.0j]) if poles is None else poles,
         inputs=inputs,
         input_names=tuple("uvwxyz"[: inputs.shape[1]]) if names is None else names,
         candidates=candidates or {},

@@ -83,6 +83,25 @@ def varying_response(system: System, u: Array, factor: Array) -> Array:
     return out
 
 
+def looped_response(
+    system: System, u: Array, back: NDArray[np.complex128], curve: Function, w: Array
+) -> Array:
+    """Output (n,) where a curve of it, held from sample to sample, acts by gains `back` (P,).
+
+    Args:
+        w: (n,) disturbance of the output, which the curve sees as well.
+    """
+    a = np.exp(system.poles)
+    gamma = (a - 1) / system.poles
+    drive, back = gamma * (u @ system.gains.T), gamma * back
+    x = np.zeros(len(system.poles), dtype=complex)
+    out = np.zeros(len(u))
+    for k in range(len(u)):
+        out[k] = 2 * x.real.sum() + w[k]
+        x = a * x + drive[k] + back * float(curve(out[k]))
+    return out
+
+
 def process_noise(system: System, n: int, rng: np.random.Generator) -> Array:
     """Output (n,) of the system's modes driven by one Brownian motion, from zero, no unit."""
     weights = rng.standard_normal((len(system.poles), 2))

@@ -20,6 +20,7 @@ from tests.discrepancy.plant_dynamics import (
     Function,
     System,
     joined,
+    looped_response,
     play,
     response,
     varying_response,
@@ -106,6 +107,25 @@ def _input_nonlinearity(s: Setting, rng: Generator) -> Planting:
     return inside(s, response(s.system, bent), curve=name, channel=f"input {channel}")
 
 
+def _nonlinear_feedback(s: Setting, rng: Generator) -> Planting:
+    """A spring, a friction or a valve where the first input acts, against what it does."""
+    curves: Mapping[str, Function] = {
+        "hardening": lambda x: np.asarray(np.clip(x, -3.0, 3.0) ** 3 / 3.0),
+        "friction": lambda x: np.asarray(np.tanh(4.0 * x)),
+        "valve": lambda x: np.asarray(np.sqrt(np.maximum(x + 2.0, 0.0)) - np.sqrt(2.0)),
+    }
+    name = str(rng.choice(list(curves)))
+    gains = s.system.gains[:, 0]
+    static = -2 * (gains / s.system.poles).real.sum()
+    back = -np.sign(static) * gains / max(abs(static), 0.2)
+    return Planting(
+        lambda amount, w: s.observe(looped_response(s.system, s.u, amount * back, curves[name], w)),
+        (0.005, 1.5),
+        lambda amount: {"amount": amount, "curve": name},
+        linear=False,
+    )
+
+
 def _saturation(s: Setting, rng: Generator) -> Planting:
     """A sensor that ends at one or two limits; the amount is the share of samples beyond them."""
     ends = str(rng.choice(["upper", "lower", "both"]))
@@ -177,6 +197,7 @@ PLANTINGS: Mapping[str, Builder] = {
     "unmodelled dynamics": _unmodelled_dynamics,
     "output nonlinearity": _output_nonlinearity,
     "input nonlinearity": _input_nonlinearity,
+    "nonlinear feedback": _nonlinear_feedback,
     "saturation": _saturation,
     "dead zone": _dead_zone,
     "hysteresis": _hysteresis,
@@ -190,6 +211,7 @@ PLANTINGS: Mapping[str, Builder] = {
 # What these and the noise effects ask of the plant around them.
 WISHES: Mapping[str, Wish] = {
     "output nonlinearity": Wish(wiener=False),
+    "nonlinear feedback": Wish(wiener=False),
     "saturation": Wish(wiener=False),
     "feedback": Wish(wiener=False),
     "calendar": Wish(stamps=True, step=HOUR),

@@ -8,7 +8,15 @@ import pyro_dynogp as dgp
 from pyro_dynogp.lti.response import mean_response
 from tests.discrepancy import plants
 from tests.discrepancy.plant_absorption import absorbed, unexplained, unexplained_by_fit
-from tests.discrepancy.plant_dynamics import System, mode, mode_slope, play, process_noise, response
+from tests.discrepancy.plant_dynamics import (
+    System,
+    looped_response,
+    mode,
+    mode_slope,
+    play,
+    process_noise,
+    response,
+)
 from tests.discrepancy.plants import CATALOGUE, EFFECTS, MULTIPLES, OUTSIDE, plant
 
 FEW = 600
@@ -50,6 +58,25 @@ def test_delayed_response_is_that_of_finer_steps(delay):
     fine = np.concatenate([np.zeros((late, 1)), np.repeat(u, parts, axis=0)])
     expected = response(finer, fine)[: len(u) * parts : parts]
     np.testing.assert_allclose(response(MODES, u, delay), expected, atol=1e-10)
+
+
+def test_a_line_in_feedback_is_another_linear_system():
+    """In discrete time: x' = (a + back c) x with c the sum of real parts."""
+    u, back = coloured(200), np.array([-0.02 + 0.01j, 0.01j])
+    found = looped_response(MODES, u, back, lambda y: 0.5 * y, np.zeros(len(u)))
+    a = np.exp(MODES.poles)
+    gamma = (a - 1) / MODES.poles
+    A = np.diag(np.concatenate([a, a.conj()]))
+    both = np.concatenate([gamma * back, (gamma * back).conj()])
+    A = A + 0.5 * np.outer(both, np.ones(4))
+    B = np.concatenate([gamma * MODES.gains[:, 0], (gamma * MODES.gains[:, 0]).conj()])
+    x, expected = np.zeros(4, dtype=complex), []
+    for value in u[:, 0]:
+        expected.append(x.sum().real)
+        x = A @ x + B * value
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    free = looped_response(MODES, u, 0.0 * back, np.tanh, np.zeros(len(u)))
+    np.testing.assert_allclose(free, response(MODES, u), atol=1e-10)
 
 
 def test_slope_of_a_mode_is_its_difference_quotient():

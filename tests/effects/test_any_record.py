@@ -17,6 +17,7 @@ from pyro_dynogp.effects.heteroscedastic import heteroscedastic_noise
 from pyro_dynogp.effects.hysteresis import hysteresis
 from pyro_dynogp.effects.input_nonlinearity import input_nonlinearity
 from pyro_dynogp.effects.level_shift import level_shift
+from pyro_dynogp.effects.nonlinear_feedback import nonlinear_feedback
 from pyro_dynogp.effects.output_nonlinearity import output_nonlinearity
 from pyro_dynogp.effects.periodic import periodic_disturbance
 from pyro_dynogp.effects.process_noise import process_noise
@@ -37,7 +38,9 @@ N = 400
 STEP = 0.1
 TIME = STEP * np.arange(N)
 
-DETECTORS = [output_nonlinearity, input_nonlinearity, saturation, dead_zone, hysteresis]
+DETECTORS = [
+    output_nonlinearity, input_nonlinearity, nonlinear_feedback, saturation, dead_zone, hysteresis,
+]  # fmt: skip
 
 
 def test_units_and_the_order_of_channels_do_not_matter_of_paths():
@@ -73,6 +76,7 @@ def test_units_and_the_order_of_channels_do_not_matter_of_shapes(detector):
         one,
         time=one.time / 3600.0,
         step=one.step / 3600.0,
+        poles=one.poles * 3600.0,
         output=1.8 * one.output + 32.0,
         mean=1.8 * one.mean + 32.0,
         deviations=1.8 * one.deviations,

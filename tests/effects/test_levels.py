@@ -16,6 +16,7 @@ from pyro_dynogp.effects.heteroscedastic import heteroscedastic_noise
 from pyro_dynogp.effects.hysteresis import hysteresis
 from pyro_dynogp.effects.input_nonlinearity import input_nonlinearity
 from pyro_dynogp.effects.level_shift import level_shift
+from pyro_dynogp.effects.nonlinear_feedback import nonlinear_feedback
 from pyro_dynogp.effects.output_nonlinearity import output_nonlinearity
 from pyro_dynogp.effects.periodic import periodic_disturbance
 from pyro_dynogp.effects.process_noise import process_noise
@@ -24,7 +25,9 @@ from tests.discrepancy.made import FEW, SETTINGS, null_record, within_chance
 from tests.discrepancy.series import check_rate, residuals
 from tests.effects.scenes import first_extra, of_the_week, stamps
 
-DETECTORS = [output_nonlinearity, input_nonlinearity, saturation, dead_zone, hysteresis]
+DETECTORS = [
+    output_nonlinearity, input_nonlinearity, nonlinear_feedback, saturation, dead_zone, hysteresis,
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("detector", [first_extra, dead_time, unmodelled_dynamics])

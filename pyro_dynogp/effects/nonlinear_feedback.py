@@ -1,0 +1,155 @@
+"""A function of the output that acts back on the dynamics: a spring, a friction, an outflow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+import torch
+
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.signals import hermite, hinges
+from pyro_dynogp.effects.base import Effect, Parameters
+from pyro_dynogp.lti.views import steady_state_gain
+from pyro_dynogp.models.system import DynamicSystem
+from pyro_dynogp.models.variants import Model, with_output_feedback
+from pyro_dynogp.statistics.detecting import lasting
+from pyro_dynogp.statistics.evidence import Evidence, Residuals
+from pyro_dynogp.statistics.pictures import about, against, evidence, labelled
+from pyro_dynogp.statistics.responses import filtered, standardised
+from pyro_dynogp.statistics.settings import LoopSettings
+from pyro_dynogp.support.tensors import as_tensor
+
+if TYPE_CHECKING:
+    from pyro_dynogp.fitting import Fit
+
+# Ends of the low, middle and high part of the output's range, as quantiles of the record.
+PARTS = (0.02, 0.35, 0.65, 0.98)
+NAMES = ("low end", "middle", "high end")
+# Standard errors by which two of their slopes must differ to be said to.
+CERTAIN = 2.0
+
+
+def nonlinear_feedback(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> Evidence:
+    r"""Test for a function of the output that drives the model's own poles.
+
+    Where x' = A x + B u + F f(y), y = C x + D u, and f departs from a line by h, the residual of
+    the linear model is to first order what the poles of A make of h(y), with y as the model has it:
+    columns are h(mean) through each pole (`filtered`), with shapes h as in the test for a function
+    of the output: Hermite polynomials of the second and third degree, apart and together, and
+    piecewise linear functions with one knot. What the mean itself does through the poles is
+    nuisance. A sensor that is not linear sets this test off as well: refits tell the two apart.
+    `where` is empty.
+
+    Source: first-order Volterra response of a feedback loop (Schetzen, The Volterra and Wiener
+    Theories of Nonlinear Systems, 1980, chapter 8); shapes after Ramsey's RESET, J. R. Stat. Soc. B
+    31:350, 1969.
+    """
+    r = residuals
+    powers, bends = hermite(r.mean), hinges(r.mean)
+    variants = [_driven(r, v) for v in (powers[:, :1], powers[:, 1:], powers, *bends.T[:, :, None])]
+    nuisance = _driven(r, r.mean[:, None])
+    scan = lasting(r, variants, nuisance, settings, seed)
+    label = labelled(f"simulated {r.output_name}", r.output_unit)
+    return evidence(
+        "nonlinear feedback",
+        scan,
+        {},
+        f"A nonlinear function of '{r.output_name}' acts back on its dynamics, "
+        f"{about(r, scan.size)}.",
+        against(r, r.mean, label, nuisance, scan.fitted),
+    )
+
+
+def _driven(r: Residuals, signals: np.ndarray) -> np.ndarray:
+    """Signals (n, c) through each pole of the model, themselves and one step later, (n, c K)."""
+    # One that does not decay within the record is as good as one that does so over its length.
+    slowest = -1.0 / (r.time[-1] - r.time[0])
+    rates = np.minimum(r.poles.real, slowest) + 1j * r.poles.imag
+    return standardised(filtered(signals, r.step, r.time, rates).reshape(len(r), -1))
+
+
+class NonlinearFeedbackOfOutput(Effect):
+    """A function of the output that acts back on the dynamics: spring, friction, outflow."""
+
+    name = "nonlinear feedback"
+    family = "shapes"
+    acts_on = "inputs"
+    freedom = 5
+    once = True
+    experiments: ClassVar = {
+        "output nonlinearity": "steps of several sizes: behind a sensor that is not linear the way "
+        "to each level takes equally long, in feedback its time or its frequency changes with size",
+        "input nonlinearity": "a step, left alone for longer than the dynamics take, from several "
+        "levels: an actuator changes its size alone, feedback its time or its frequency",
+    }
+    test = staticmethod(nonlinear_feedback)
+
+    def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
+        """A static layer that sees the output and acts on the last dynamic layer."""
+        extended = with_output_feedback(model)
+        return [] if extended is None else [extended]
+
+    def parameters(self, fit: Fit, evidence: Evidence, record: Record) -> Parameters:
+        """Inverse steady-state gain at the low end, in the middle and at the high end.
+
+        The input that holds the output at y is u(y) = (y - G_f f(y)) / G_u, with steady-state gains
+        G_u from the input and G_f from what comes back. Posterior mean and standard deviation of
+        its mean slope in each part of the output's range [input / output]; of the input with the
+        largest gain. None for several outputs, for integrators, and without inputs.
+        """
+        model, scaling = fit.model, fit.scaling
+        fed = [wire for wire in model.wires if wire.feedback]
+        if model.outputs > 1 or len(fed) != 1 or len(fed[0].feedback) != 1:
+            return {}
+        system, (name,) = fit.system_at(fit.draws), fed[0].feedback
+        dynamic, function = system.layer(fed[0].name), system.layer(name)
+        assert isinstance(dynamic, DynamicSystem)
+        assert not isinstance(function, DynamicSystem)
+        if bool((dynamic.modes.poles == 0).any()) or fed[0].sources != ("inputs",):
+            return {}
+        gains = steady_state_gain(dynamic.modes).numpy()
+        gains = gains.reshape(-1, gains.shape[-1])
+        if gains.shape[1] == 1:
+            return {}
+        of_inputs, back = gains[:, :-1], gains[:, -1:]
+        which = int(np.abs(of_inputs).mean(0).argmax())
+        y = record.outputs[:, 0]
+        at = np.quantile(y[np.isfinite(y)], PARTS)
+        scaled = (at - scaling.output_offset[0]) / scaling.output_scale[0]
+        with torch.no_grad():
+            values = function.mean(as_tensor(scaled[:, None]), scaled)
+        f = values.numpy().reshape(-1, len(at))
+        u = (scaled - back * f) / of_inputs[:, [which]]
+        slopes = np.diff(u) / np.diff(scaled) * scaling.input_scale[which] / scaling.output_scale[0]
+        unit = "/".join(x or "1" for x in (scaling.input_units[which], scaling.output_units[0]))
+        unit = "" if unit == "1/1" else unit
+        whose = f"inverse steady-state gain of {scaling.input_names[which]}"
+        return {
+            labelled(f"{whose}, {part}", unit): (float(slope.mean()), float(slope.std()))
+            for part, slope in zip(NAMES, slopes.T, strict=True)
+        }
+
+    def shape(self, parameters: Parameters) -> str:
+        """Whether it hardens or softens, where the parts differ by two standard deviations."""
+        slopes = [pair for label, pair in parameters.items() if label.startswith("inverse steady")]
+        if len(slopes) != len(NAMES):
+            return ""
+        (low, _), (middle, _), (high, _) = slopes
+        ends = [_sign(slopes[k], slopes[1]) for k in (0, 2)]
+        if not any(ends) or not all(np.isfinite(v) for v in (low, middle, high)):
+            return ""
+        if ends[0] == ends[1]:
+            return "It hardens to both ends." if ends[0] > 0 else "It softens to both ends."
+        words = {1: "hardens", -1: "softens"}
+        both = zip(ends, (NAMES[0], NAMES[2]), strict=True)
+        said = [f"{words[sign]} to the {end}" for sign, end in both if sign]
+        return f"It {' and '.join(said)}."
+
+
+def _sign(end: tuple[float, float], middle: tuple[float, float]) -> int:
+    """Whether the slope at an end is certainly steeper (1) or less steep (-1), else 0."""
+    difference = abs(end[0]) - abs(middle[0])
+    certain = abs(difference) > CERTAIN * np.hypot(end[1], middle[1])
+    return int(np.sign(difference)) if certain else 0

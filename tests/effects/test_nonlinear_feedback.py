@@ -1,0 +1,199 @@
+"""A function of the output that acts back on the dynamics: its test, its block and its numbers."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+import pyro_dynogp as dgp
+from pyro_dynogp.effects.dead_time import dead_time
+from pyro_dynogp.effects.nonlinear_feedback import (
+    NonlinearFeedbackOfOutput,
+    nonlinear_feedback,
+)
+from pyro_dynogp.effects.output_nonlinearity import output_nonlinearity
+from pyro_dynogp.models.system import DynamicSystem
+from pyro_dynogp.models.variants import with_output_feedback
+from tests.discrepancy.made import SETTINGS, coloured, residuals_of
+
+STEP, DAMPING, STIFFNESS = 0.05, 0.6, 4.0
+POLE = complex(-0.5 * DAMPING, np.sqrt(STIFFNESS - 0.25 * DAMPING**2))
+EFFECT = NonlinearFeedbackOfOutput()
+
+
+def sprung(u, cubic):
+    """Displacement (n,) under x'' + 0.6 x' + 4 x + cubic x^3 = u, held, by small steps."""
+    x = v = 0.0
+    out = np.empty(len(u))
+    for k, force in enumerate(u):
+        out[k] = x
+        for _ in range(20):
+            v += STEP / 20 * (force - DAMPING * v - STIFFNESS * x - cubic * x**3)
+            x += STEP / 20 * v
+    return out
+
+
+def pushed(seed, n, size=5.0):
+    return np.repeat(size * np.random.default_rng(seed).standard_normal(n // 4), 4)
+
+
+@pytest.fixture(scope="module")
+def spring():
+    u = pushed(0, 600)
+    y = sprung(u, 4.0)
+    noise = 0.02 * y.std() * np.random.default_rng(1).standard_normal(len(u))
+    return dgp.Record(time=STEP * np.arange(len(u)), inputs=u, outputs=y + noise,
+                      input_names=("force",), output_names=("x",), input_units=("N",),
+                      output_units=("mm",), time_unit="s")  # fmt: skip
+
+
+class TestDetection:
+    def seen(self, seed, cubic, noise=0.05, **more):
+        """Residuals of the spring's linear part, which has the right poles."""
+        u = pushed(seed, 500, 1.5)
+        mean, y = sprung(u, 0.0), sprung(u, cubic)
+        e = noise * mean.std() * coloured(np.random.default_rng(seed), 500, 0.5)
+        return residuals_of(
+            y + e, mean, u[:, None], step=STEP, poles=np.array([POLE]), **more
+        )  # fmt: skip
+
+    def test_a_weak_spring_is_found(self):
+        r = self.seen(0, 1.0)
+        found = nonlinear_feedback(r, SETTINGS)
+        assert found.p_value < 1e-4
+        assert found.where == {}
+        assert "acts back on its dynamics" in found.sentence
+        # To first order the poles make the residual; a function at once explains less.
+        assert found.gain > output_nonlinearity(r, SETTINGS).gain + 10.0
+        assert found.gain > dead_time(r, SETTINGS).gain + 10.0
+
+    def test_the_poles_are_those_of_the_model(self):
+        r = self.seen(0, 1.0)
+        right = nonlinear_feedback(r, SETTINGS).gain
+        wrong = dataclasses.replace(r, poles=np.array([-20.0 + 1.0j]))
+        assert nonlinear_feedback(wrong, SETTINGS).gain < right - 10.0
+
+    def test_what_the_mean_does_through_the_poles_is_no_evidence(self):
+        """Other poles than the model's are a parameter's affair."""
+        p = []
+        for seed in range(20):
+            u = pushed(seed, 500, 1.5)
+            mean = sprung(u, 0.0)
+            other = np.roll(mean, 1)
+            e = 0.05 * mean.std() * coloured(np.random.default_rng(seed), 500, 0.5)
+            r = residuals_of(0.9 * mean + 0.1 * other + e, mean, u[:, None], step=STEP,
+                             poles=np.array([POLE]))  # fmt: skip
+            p.append(nonlinear_feedback(r, SETTINGS).p_value)
+        assert np.mean(np.array(p) <= 0.05) <= 0.2
+
+    def test_poles_at_zero_are_as_slow_as_the_record(self):
+        r = dataclasses.replace(self.seen(1, 0.0), poles=np.array([0.0j, POLE]))
+        assert 0.0 < nonlinear_feedback(r, SETTINGS).p_value <= 1.0
+
+
+class TestBlock:
+    def test_a_function_sees_the_output_and_comes_back(self, spring):
+        (model,) = EFFECT.extend(dgp.LinearDynamicGP(1, pairs=2), None, spring)
+        looped = {wire.name: wire.feedback for wire in model.wires}
+        assert looped == {"g": ("feedback",), "feedback": ()}
+        assert model.output_wire.name == "g"
+        assert model.dynamic[0][1].pairs == 2
+
+    def test_a_function_before_the_dynamics_stays(self, spring):
+        (model,) = EFFECT.extend(dgp.Hammerstein(1), None, spring)
+        assert [wire.name for wire in model.wires if wire.feedback] == [model.output_wire.name]
+        assert len(model.layers) == 3
+
+    @pytest.mark.parametrize(
+        "model",
+        [
+            dgp.Wiener(1),
+            dgp.NonlinearFeedback(1),
+            dgp.LinearDynamicGP(1, likelihood=dgp.StudentT(4)),
+            dgp.LinearDynamicGP(1, likelihood=dgp.Heteroscedastic(of="output")),
+        ],
+        ids=["function of the output", "feedback", "heavy tails", "noise of the output"],
+    )
+    def test_elsewhere_there_is_no_such_block(self, model, spring):
+        assert EFFECT.extend(model, None, spring) == []
+        assert with_output_feedback(model) is None
+
+
+class TestNumbers:
+    def test_slopes_of_a_spring(self, spring):
+        fit = dgp.fit(dgp.NonlinearFeedback(1), spring, method="map", restarts=1, workers=1,
+                      progress=False)  # fmt: skip
+        found = EFFECT.parameters(fit, None, spring)
+        assert list(found) == [
+            f"inverse steady-state gain of force, {part} [N/mm]"
+            for part in ("low end", "middle", "high end")
+        ]
+        at = np.quantile(spring.outputs[:, 0], (0.02, 0.35, 0.65, 0.98))
+        force = STIFFNESS * at + 4.0 * at**3
+        slopes = [pair[0] for pair in found.values()]
+        np.testing.assert_allclose(slopes, np.diff(force) / np.diff(at), rtol=0.1)
+        assert EFFECT.shape(found) == "It hardens to both ends."
+
+    def test_of_draws_mean_and_standard_deviation(self, spring):
+        """u(y) = (y - G_f f(y)) / G_u for a stand-in whose gains and function are known."""
+        gains = torch.tensor([[2.0, -1.0], [4.0, -1.0]]).double()
+        pole = torch.full((2, 1), -1.0 + 0.0j, dtype=torch.complex128)
+        modes = dgp.Modes(pole, input_gain=gains.unsqueeze(1) + 0.0j, output_gain=0.5 + 0.0 * pole)
+        square = SimpleNamespace(mean=lambda x, t: x.pow(2).expand(2, -1, 1))
+        layers = {"g": DynamicSystem(modes, 1.0), "f": square}
+        system = SimpleNamespace(layer=layers.__getitem__)
+        model = dgp.NonlinearFeedback(1)
+        scaling = SimpleNamespace(
+            input_scale=np.array([3.0]), output_scale=np.array([0.5]),
+            output_offset=np.array([1.0]), input_names=("u",), input_units=("",),
+            output_units=("",),
+        )  # fmt: skip
+        fit = SimpleNamespace(model=model, scaling=scaling, draws={}, system_at=lambda _: system)
+        record = SimpleNamespace(outputs=np.linspace(0.0, 2.0, 101)[:, None])
+        found = EFFECT.parameters(fit, None, record)
+        y = (np.quantile(record.outputs, (0.02, 0.35, 0.65, 0.98)) - 1.0) / 0.5
+        slope = (1.0 + y[1:] + y[:-1]) * 3.0 / 0.5  # (y + y^2) / G_u, G_u = 2 and 4
+        expected = [(v * (1 / 2 + 1 / 4) / 2, abs(v) * (1 / 2 - 1 / 4) / 2) for v in slope]
+        np.testing.assert_allclose(list(found.values()), expected, rtol=1e-12)
+
+    def test_none_for_what_has_no_steady_state(self, spring):
+        line = SimpleNamespace(model=dgp.LinearDynamicGP(1), scaling=None)
+        assert EFFECT.parameters(line, None, spring) == {}
+
+    @pytest.mark.parametrize(
+        ("slopes", "words"),
+        [
+            ((2.0, 1.0, 2.0), "It hardens to both ends."),
+            ((0.4, 1.0, 0.5), "It softens to both ends."),
+            ((-2.0, -1.0, -2.0), "It hardens to both ends."),
+            ((2.0, 1.0, 1.01), "It hardens to the low end."),
+            ((0.5, 1.0, 2.0), "It softens to the low end and hardens to the high end."),
+            ((1.01, 1.0, 0.99), ""),
+        ],
+    )
+    def test_shape_in_words(self, slopes, words):
+        parts = {f"inverse steady-state gain of u, {k}": (v, 0.02) for k, v in enumerate(slopes)}
+        assert EFFECT.shape(parts) == words
+        assert EFFECT.shape({}) == ""
+
+    def test_differences_within_two_errors_are_none(self):
+        parts = {f"inverse steady-state gain of u, {k}": (1.0 + k, 0.5) for k in range(3)}
+        assert EFFECT.shape(parts) == ""
+        sharper = {label: (mean, 0.3) for label, (mean, _) in parts.items()}
+        assert EFFECT.shape(sharper) == "It softens to the low end and hardens to the high end."
+
+
+def test_the_loop_names_a_spring(spring):
+    linear = dgp.fit(dgp.LinearDynamicGP(1, pairs=1), spring[:350], method="map", workers=1,
+                     progress=False)  # fmt: skip
+    report = dgp.close_loop(
+        linear, spring, max_rounds=1, workers=1, progress=False,
+        effects=[e for e in dgp.effects.CATALOGUE
+                 if e.name in ("nonlinear feedback", "output nonlinearity")],
+    )  # fmt: skip
+    assert [effect.name for effect in report.effects] == ["nonlinear feedback"]
+    assert report.effects[0].ties == ()
+    assert report.effects[0].sentence.endswith("It hardens to both ends.")
+    assert report.after["rmse"] < 0.3 * report.before["rmse"]

@@ -1,0 +1,26 @@
+"""Of which line warnings are."""
+
+import inspect
+
+import pytest
+
+from pyro_dynogp.support.errors import warn
+
+
+def module(name, code, **names):
+    """Names of a module that runs some code."""
+    space = {"__name__": name, **names}
+    exec(compile(code, f"{name}.py", "exec"), space)
+    return space
+
+
+def test_warnings_are_of_the_line_that_called_through_other_libraries():
+    inner = module("pyro_dynogp.inner", "def work(): warn('careful')", warn=warn)
+    library = module("library", "def run(call): call()")
+    outer = module(
+        "pyro_dynogp.outer", "def fit(): run(work)", run=library["run"], work=inner["work"]
+    )
+    with pytest.warns(UserWarning, match="careful") as caught:
+        line = inspect.currentframe().f_lineno + 1
+        outer["fit"]()
+    assert [(one.filename, one.lineno) for one in caught] == [(__file__, line)]
