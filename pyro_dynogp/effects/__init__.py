@@ -19,6 +19,7 @@ from pyro_dynogp.effects.heavy_tails import HeavyTails
 from pyro_dynogp.effects.heteroscedastic import HeteroscedasticNoise
 from pyro_dynogp.effects.hysteresis import Hysteresis
 from pyro_dynogp.effects.input_nonlinearity import InputNonlinearity
+from pyro_dynogp.effects.integrator import Integrator
 from pyro_dynogp.effects.level_shift import LevelShift
 from pyro_dynogp.effects.nonlinear_feedback import NonlinearFeedbackOfOutput
 from pyro_dynogp.effects.output_nonlinearity import OutputNonlinearity
@@ -29,8 +30,8 @@ from pyro_dynogp.effects.saturation import Saturation
 __all__ = ["CATALOGUE", "Effect"]
 
 CATALOGUE: tuple[Effect, ...] = (
-    ExtraInput(), DeadTime(), UnmodelledDynamics(), OutputNonlinearity(), InputNonlinearity(),
-    NonlinearFeedbackOfOutput(), Saturation(), DeadZoneOfInput(), Hysteresis(), Drift(),
-    LevelShift(), PeriodicDisturbance(), CalendarEffect(), ClockShift(), HeavyTails(),
-    HeteroscedasticNoise(), ProcessNoise(), Feedback(),
+    ExtraInput(), DeadTime(), UnmodelledDynamics(), Integrator(), OutputNonlinearity(),
+    InputNonlinearity(), NonlinearFeedbackOfOutput(), Saturation(), DeadZoneOfInput(),
+    Hysteresis(), Drift(), LevelShift(), PeriodicDisturbance(), CalendarEffect(), ClockShift(),
+    HeavyTails(), HeteroscedasticNoise(), ProcessNoise(), Feedback(),
 )  # fmt: skip

@@ -16,7 +16,7 @@ from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
 from pyro_dynogp.statistics.pictures import about, evidence, labelled, unit
 from pyro_dynogp.statistics.regression import with_past
 from pyro_dynogp.statistics.settings import LoopSettings
-from pyro_dynogp.statistics.shares_of_inputs import linear_responses, paths
+from pyro_dynogp.statistics.shares_of_inputs import linear_responses, paths, several_valued
 
 # Widths of play that are tried, against the range of the signal.
 WIDTHS = np.geomspace(0.02, 0.8, 10)
@@ -28,18 +28,20 @@ def hysteresis(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -
     Columns: the model's own path driven by play(u_j, width) - u_j, and play(mean, width) - mean.
     A phase lag, which differs from play in that it depends on frequency, is left to the responses
     of the inputs. `where`: channel (the output's name for play there), width (full, of that
-    channel's unit).
+    channel's unit). Play makes nothing but another gain and level of an input of two values, which
+    is left out.
     """
     r = residuals
     path = paths(r)
     nuisance = linear_responses(r, path)
-    signals = [*r.inputs.T, r.mean]
-    names = [*r.input_names, r.output_name]
+    used = several_valued(r)
+    signals = [*(r.inputs[:, j] for j in used), r.mean]
+    names = [*(r.input_names[j] for j in used), r.output_name]
 
     def columns(j: int, widths: np.ndarray) -> np.ndarray:
         s = signals[j]
         lost = np.column_stack([play(s, w) - s for w in widths])
-        return path(j, lost) if j < len(signals) - 1 else lost
+        return path(used[j], lost) if j < len(used) else lost
 
     ranges = [float(np.ptp(np.quantile(s, [0.01, 0.99]))) for s in signals]
     tried = [(j, k) for j in range(len(signals)) for k in range(len(WIDTHS))]

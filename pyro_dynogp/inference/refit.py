@@ -177,7 +177,7 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     such a model starts from linear fits of its own, too; a function in feedback from what is
     learnt, where nothing comes back as yet.
 
-    A linear model with more pairs has the starts of a first fit, too: what is new may take the
+    A linear model with more poles has the starts of a first fit, too: what is new may take the
     place of what is learnt.
 
     Process noise that has explained what the smaller model lacks keeps the larger one from
@@ -195,7 +195,8 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     if target.is_linear:
         if run.steps:
             return climbed(target, [_best(problem, starts)], run.steps)
-        more = target.dynamic[0][1].pairs > fit.model.dynamic[0][1].pairs
+        before, after = (one.dynamic[0][1] for one in (fit.model, target))
+        more = after.pairs > before.pairs or after.integrators > before.integrators
         fresh = linear_starts(target, records, None, run.seed) if more else []
         return climbed(target, [*fresh, *starts], LINEAR_STEPS)
     if len(target.layers) > len(fit.model.layers):
@@ -203,6 +204,8 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
             starts += starting_points(target, records, run, count=FRESH, steps=FRESH_STEPS)
         return climb(target, records, starts, [], run, steps=run.steps or ADDED_STEPS,
                      optimizer=optimizer_for(target), effort=EXTENDED)  # fmt: skip
+    if run.steps:  # a few, to compare variants
+        starts = [_best(problem, starts)]
     quiet = without_noise_below_functions(target)
     if quiet != target:
         best = climbed(quiet, [louder(start) for start in starts], LAYERED_STEPS)[0]

@@ -52,6 +52,18 @@ def with_pairs(model: Model, count: int) -> Model:
     return with_dynamics(model, lambda _, layer: replace(layer, pairs=layer.pairs + count))
 
 
+def with_integrator(model: Model) -> Model | None:
+    """The model with a pole at zero in its last dynamic layer; None where there is one, or none."""
+    if not model.dynamic or not model.dynamic[-1][0].channels:
+        return None
+    last = model.dynamic[-1][0].name
+    if any(layer.integrators for _, layer in model.dynamic):
+        return None
+    return with_dynamics(
+        model, lambda wire, layer: replace(layer, integrators=1) if wire.name == last else layer
+    )
+
+
 def with_process_noise(model: Model) -> Model:
     """The model with process noise in every dynamic layer."""
     return with_dynamics(model, lambda _, layer: replace(layer, process_noise=True))

@@ -101,6 +101,11 @@ def _poles(residuals: Residuals) -> np.ndarray:
     return np.log(kept.astype(complex)) / r.step
 
 
+def several_valued(residuals: Residuals) -> list[int]:
+    """Places of the inputs that take more than two values."""
+    return [j for j, u in enumerate(residuals.inputs.T) if len(np.unique(u[np.isfinite(u)])) > 2]
+
+
 def looked_at(residuals: Residuals) -> int:
     """Number of samples that are held out and measured."""
     return int((residuals.held_out & np.isfinite(residuals.output)).sum())

@@ -76,6 +76,24 @@ def _unmodelled_dynamics(s: Setting, rng: Generator) -> Planting:
     )
 
 
+def _integrator(s: Setting, rng: Generator) -> Planting:
+    """The integral of the first input beside the response; it leaks nowhere."""
+    del rng
+    first = s.u[:, 0] - s.u[s.window, 0].mean()
+    integral = standard(np.concatenate([[0.0], np.cumsum(first)[:-1]]), s.window)
+    slow = (-1.0 + 1.0j) / s.samples
+    # The model may take a slow pole for it.
+    swapped = [np.where(np.arange(len(s.system.poles)) == k, slow, s.system.poles)
+               for k in range(len(s.system.poles))]  # fmt: skip
+    return Planting(
+        lambda amount, w: s.observe(response(s.system, s.u) + w + amount * integral),
+        (0.02, 20.0),
+        lambda amount: {"amount": amount, "channel": "input 0"},
+        linear=False,
+        starts=(s.system.poles, *swapped),
+    )
+
+
 def _curve(rng: Generator) -> tuple[str, Function]:
     """A static nonlinearity of a signal of standard deviation one."""
     curves: Mapping[str, Function] = {
@@ -195,6 +213,7 @@ PLANTINGS: Mapping[str, Builder] = {
     "extra input": _extra_input,
     "dead time": _dead_time,
     "unmodelled dynamics": _unmodelled_dynamics,
+    "integrator": _integrator,
     "output nonlinearity": _output_nonlinearity,
     "input nonlinearity": _input_nonlinearity,
     "nonlinear feedback": _nonlinear_feedback,

@@ -20,7 +20,7 @@ from tests.discrepancy.plant_dynamics import (
 from tests.discrepancy.plants import CATALOGUE, EFFECTS, MULTIPLES, OUTSIDE, plant
 
 FEW = 600
-SLOW = ("dead time", "unmodelled dynamics")  # their size is that of a nonlinear fit
+SLOW = ("dead time", "unmodelled dynamics", "integrator")  # their size is that of a nonlinear fit
 MODES = System(np.array([-0.05 + 0.2j, -0.1 + 0.6j]), np.array([[1.0 + 0.3j], [0.4 - 1.0j]]))
 
 

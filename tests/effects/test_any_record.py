@@ -16,6 +16,7 @@ from pyro_dynogp.effects.heavy_tails import heavy_tails
 from pyro_dynogp.effects.heteroscedastic import heteroscedastic_noise
 from pyro_dynogp.effects.hysteresis import hysteresis
 from pyro_dynogp.effects.input_nonlinearity import input_nonlinearity
+from pyro_dynogp.effects.integrator import integrator
 from pyro_dynogp.effects.level_shift import level_shift
 from pyro_dynogp.effects.nonlinear_feedback import nonlinear_feedback
 from pyro_dynogp.effects.output_nonlinearity import output_nonlinearity
@@ -59,7 +60,7 @@ def test_units_and_the_order_of_channels_do_not_matter_of_paths():
         input_names=("v", "u"),
         candidates={"w": 0.01 * w + 1.0},
     )
-    for detector in (first_extra, dead_time, unmodelled_dynamics):
+    for detector in (first_extra, dead_time, unmodelled_dynamics, integrator):
         a, b = detector(one, SETTINGS), detector(other, SETTINGS)
         assert a.p_value == pytest.approx(b.p_value, rel=1e-3, abs=0.003)
         assert 1.8 * a.size == pytest.approx(b.size, rel=1e-3)

@@ -15,6 +15,7 @@ from pyro_dynogp.effects.heavy_tails import heavy_tails
 from pyro_dynogp.effects.heteroscedastic import heteroscedastic_noise
 from pyro_dynogp.effects.hysteresis import hysteresis
 from pyro_dynogp.effects.input_nonlinearity import input_nonlinearity
+from pyro_dynogp.effects.integrator import integrator
 from pyro_dynogp.effects.level_shift import level_shift
 from pyro_dynogp.effects.nonlinear_feedback import nonlinear_feedback
 from pyro_dynogp.effects.output_nonlinearity import output_nonlinearity
@@ -30,7 +31,7 @@ DETECTORS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("detector", [first_extra, dead_time, unmodelled_dynamics])
+@pytest.mark.parametrize("detector", [first_extra, dead_time, unmodelled_dynamics, integrator])
 def test_level_of_paths(detector):
     p = np.array([detector(null_record(seed, 240), SETTINGS).p_value for seed in range(100)])
     assert within_chance((p <= 0.05).sum(), 100, 0.05)
