@@ -24,9 +24,9 @@ class LoopSettings:
         special: share of a gain that a special case of an effect may lack and still be named.
             Evidence: reason: what is left are differences of fits; half and double of it name
             the same effect for all 114 stored refits.
-        harm: share of the mean absolute error of forecasts that an effect of the noise may cost.
+        harm: share of the mean absolute error of forecasts that an effect may cost.
             Evidence: reason: other weights of samples move a model a little; half and double of
-            it judge none of 114 stored refits otherwise.
+            it judge none of 114 stored refits otherwise, of which those of the noise had errors.
         outside: how many times as much a cause outside the catalogue must explain before an effect
             is doubted. Evidence: counted once, by an earlier version whose rows are not kept: of 15
             development plants with an effect of the catalogue it explained at most 1.03 times as
@@ -36,10 +36,11 @@ class LoopSettings:
             Evidence: half and double of it add the same effect to 21 stored records.
         gate: share of `level` for each of the two answers to whether anything is left.
             Evidence: two tests, Bonferroni.
-        worse: ratio of scores of the last block from which a report warns.
+        worse: ratio of errors after to before from which effects do harm: on the last block (by
+            RMSE and CRPS), so that the report keeps the model before.
             Evidence: reason: effects of the noise change scores by chance.
-        worse_errors: standard errors of a loss of log density from which a report warns.
-            Evidence: convention.
+        worse_errors: standard errors of a loss of log density on the last block from which effects
+            do harm. Evidence: convention.
         block_samples: fewest samples of the block that is searched and of the one reported on.
             Evidence: none.
         measured_samples: fewest measured samples of those blocks, and of whatever is tested.

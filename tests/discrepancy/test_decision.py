@@ -14,16 +14,11 @@ import pyro_dynogp as dgp
 from pyro_dynogp import effects
 from pyro_dynogp.data.channels import Calendar, Delayed, ShiftedClock
 from pyro_dynogp.discrepancy.blocks import shared
-from pyro_dynogp.discrepancy.decision import (
-    _first_in_line,
-    _judge,
-    _Judged,
-    _specific,
-    _too_special,
-    confirm,
-)
+from pyro_dynogp.discrepancy.decision import _first_in_line, _specific, _too_special, confirm
+from pyro_dynogp.discrepancy.held_out import interleaved, stretches
+from pyro_dynogp.discrepancy.judged import Judged, judge
 from pyro_dynogp.discrepancy.search import Found
-from pyro_dynogp.discrepancy.trials import Tried, interleaved, stretches
+from pyro_dynogp.discrepancy.trials import Tried
 from pyro_dynogp.statistics.evidence import Evidence
 from pyro_dynogp.statistics.settings import LoopSettings
 from tests.discrepancy.made import SETTINGS
@@ -41,15 +36,15 @@ def tried(gains: np.ndarray, **options: Any) -> Tried:
     return Tried(MODEL, gains, 0.0, **options)
 
 
-def helping(effect: effects.Effect, p: float, q: float, gain: float = 50.0) -> _Judged:
+def helping(effect: effects.Effect, p: float, q: float, gain: float = 50.0) -> Judged:
     n = 100
     kind = ("after", effect.score)
     noise = np.random.default_rng(0).normal(0.0, 0.1, n)
     found = spoken_for(effect, p, q)
-    return _judge(found, kind, tried(noise + gain / n), tried(np.zeros(n)), 1, SETTINGS)
+    return judge(found, kind, tried(noise + gain / n), tried(np.zeros(n)), 1, SETTINGS)
 
 
-def names(judged: list[_Judged]) -> list[str]:
+def names(judged: list[Judged]) -> list[str]:
     return [one.found.effect.name for one in judged]
 
 
@@ -101,11 +96,11 @@ def test_a_special_case_gives_its_name_where_it_is_certain_or_alone(q, others, t
     assert _too_special(found, others, 0.05) == too_special
 
 
-def judged_noise(gains: np.ndarray, errors: np.ndarray, before: np.ndarray) -> _Judged:
+def judged_noise(gains: np.ndarray, errors: np.ndarray, before: np.ndarray) -> Judged:
     """A candidate for the noise with gains (N,), and errors of forecasts before and after."""
     found = spoken_for(effects.HeavyTails(), 1e-9, 1e-8)
     base = tried(0.0 * gains, errors=before[:, None])
-    return _judge(
+    return judge(
         found, ("after", "one step"), tried(gains, errors=errors[:, None]), base, 1, SETTINGS
     )
 
@@ -123,6 +118,18 @@ def test_noise_that_costs_the_forecasts_does_not_help() -> None:
     assert judged_noise(gains, wild, wild).helps
     missing = np.where(np.arange(100) % 3 == 0, np.nan, 1.5 * before)
     assert not judged_noise(gains, missing, missing / 1.5).helps
+
+
+def test_structure_that_costs_the_forecasts_does_not_help() -> None:
+    """Densities of forecasts may rise, as where their sds grow, and errors all the same."""
+    found = spoken_for(effects.Drift(), 1e-9, 1e-8)
+    before = 3.0 * np.resize([1.0, -1.0], 100)[:, None]
+    base = tried(np.zeros(100), errors=before)
+    for ratio, helps in ((0.5, True), (1.04, True), (1.06, False), (3.0, False)):
+        more = tried(np.ones(100), errors=ratio * before)
+        judged = judge(found, ("after", "forecast"), more, base, 1, SETTINGS)
+        assert judged.helps is helps
+        assert ("forecasts worse by" in judged.attempt.reason) is not helps
 
 
 def test_one_outlier_does_not_hide_what_all_samples_gain() -> None:
