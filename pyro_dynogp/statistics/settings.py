@@ -37,10 +37,13 @@ class LoopSettings:
         gate: share of `level` for each of the two answers to whether anything is left.
             Evidence: two tests, Bonferroni.
         worse: ratio of errors after to before from which effects do harm: on the last block (by
-            RMSE and CRPS), so that the report keeps the model before.
+            RMSE and CRPS), so that the report keeps the model before; and of a line in time to
+            the last level held (by RMSE), beyond which it is not added.
             Evidence: reason: effects of the noise change scores by chance.
         worse_errors: standard errors of a loss of log density on the last block from which effects
             do harm. Evidence: convention.
+        level_samples: over which the last level is averaged that a drift is held at.
+            Evidence: reason: white noise of ten samples averages to a third.
         block_samples: fewest samples of the block that is searched and of the one reported on.
             Evidence: none.
         measured_samples: fewest measured samples of those blocks, and of whatever is tested.
@@ -102,6 +105,7 @@ class LoopSettings:
     gate: float = 0.5
     worse: float = 1.05
     worse_errors: float = 2.0
+    level_samples: int = 10
     block_samples: int = 60
     measured_samples: int = 30
     fit_share: float = 0.5
