@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from pyro_dynogp.criticism.comparison import block_standard_error
-from pyro_dynogp.discrepancy.result import Attempt
+from pyro_dynogp.discrepancy.result import Attempt, Decision
 from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.discrepancy.trials import Tried
 from pyro_dynogp.effects.base import Score
@@ -56,15 +56,38 @@ def judge(
     if not helps and certain(capped, settings):
         helps = True
         reason += f"; {capped.sum():+.1f} with no sample counted for more than {settings.cap:.0f}"
-    if len(tried.errors):  # what is one step ahead for the noise must not cost the structure
+    harms = False
+    if len(tried.errors):  # what makes data more probable must not cost their forecasts
         loss = loss_of(tried.errors, base.errors)
-        if harms := certain(loss, settings) and loss.mean() > settings.harm:
+        harms = certain(loss, settings) and bool(loss.mean() > settings.harm)
+        if harms:
             reason += (
                 f"; forecasts worse by {loss.sum():.1f} +- {block_standard_error(loss)[0]:.1f}"
             )
-        helps = helps and not harms
-    attempt = Attempt(number, evidence, q, "rejected", reason, gain, error, tried.seconds)
+    helps = helps and not harms
+    wanted = 0 if helps or harms else enough_samples(gain, error, len(d), settings)
+    if wanted:
+        reason += f"; about {wanted} samples like these {len(d)} would settle it"
+    decision: Decision = "nearly" if wanted else "rejected"
+    attempt = Attempt(number, evidence, q, decision, reason, gain, error, tried.seconds)
     return Judged(found, kind, tried, attempt, helps)
+
+
+def enough_samples(gain: float, error: float, count: int, settings: LoopSettings) -> int:
+    """How many samples would make a gain certain that nearly is; 0 where it is not nearly so.
+
+    Nearly is from `settings.nearly` block standard errors on. A gain grows like the number of
+    samples and its error like the square root of it, so that gain / error = c takes
+    (c error / gain)^2 times as many; rounded up to two digits.
+
+    Args:
+        gain, error: in log density of `count` samples, with its block standard error [nats].
+    """
+    if not settings.nearly * error <= gain <= settings.standard_errors * error or gain <= 0.0:
+        return 0
+    wanted = count * max((settings.standard_errors * error / gain) ** 2, settings.gain / gain)
+    digit = 10 ** max(int(np.log10(wanted)) - 1, 0)
+    return int(np.ceil(wanted / digit)) * digit
 
 
 def certain(gains: np.ndarray, settings: LoopSettings) -> bool:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pyro_dynogp.models.description import Part
     from pyro_dynogp.prediction.prediction import Prediction
 
-Decision = Literal["accepted", "tie", "rejected", "undecided", "not tried", "reported"]
+Decision = Literal["accepted", "tie", "nearly", "rejected", "undecided", "not tried", "reported"]
 # What became of a test.
 Outcome = Decision | Literal["not significant"]
 # The outcome where what was found does harm on the last block.
@@ -36,7 +36,8 @@ class Attempt:
     Attributes:
         round: number, from 1. evidence: of the test. q_value: false discovery rate at which it
             passes among all tests of the round.
-        decision: what became of it. reason: why, in words.
+        decision: what became of it; "nearly" where it is rejected by little, and "undecided" where
+            the time limit came first. reason: why, in words.
         gain, gain_error: elpd of held-out data after less before, and its block standard error
             [nats]; NaN where it was not refitted.
         seconds: that refits took.

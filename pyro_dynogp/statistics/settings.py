@@ -18,6 +18,8 @@ class LoopSettings:
         standard_errors: block standard errors that such a gain must exceed.
             Evidence: coverage of the error under autocorrelation is measured in the tests of
             `criticism.comparison`; 1 and 3 judge 9 and 6 of 114 stored refits otherwise.
+        nearly: block standard errors from which a gain that is not enough is called nearly so.
+            Evidence: convention: of gains of nothing 4 % lie between 1.5 and 2 errors.
         cap: most that one sample counts for where the plain sum is not certain [nats].
             Evidence: reason: an outlier makes the standard error as large as the sum; half and
             double of it judge none of 114 stored refits otherwise.
@@ -97,6 +99,7 @@ class LoopSettings:
 
     gain: float = 4.0
     standard_errors: float = 2.0
+    nearly: float = 1.5
     cap: float = 10.0
     special: float = 0.05
     harm: float = 0.05

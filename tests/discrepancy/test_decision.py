@@ -12,11 +12,12 @@ from scipy.stats import binom
 
 import pyro_dynogp as dgp
 from pyro_dynogp import effects
+from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.data.channels import Calendar, Delayed, ShiftedClock
 from pyro_dynogp.discrepancy.blocks import shared
 from pyro_dynogp.discrepancy.decision import _first_in_line, _specific, _too_special, confirm
 from pyro_dynogp.discrepancy.held_out import interleaved, stretches
-from pyro_dynogp.discrepancy.judged import Judged, judge
+from pyro_dynogp.discrepancy.judged import Judged, enough_samples, judge
 from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.discrepancy.trials import Tried
 from pyro_dynogp.statistics.evidence import Evidence
@@ -130,6 +131,37 @@ def test_structure_that_costs_the_forecasts_does_not_help() -> None:
         judged = judge(found, ("after", "forecast"), more, base, 1, SETTINGS)
         assert judged.helps is helps
         assert ("forecasts worse by" in judged.attempt.reason) is not helps
+
+
+@pytest.mark.parametrize(
+    ("gain", "error", "wanted"),
+    [
+        (14.9, 10.0, 0),
+        (15.1, 10.0, 180),  # 100 (20 / 15.1)^2 = 175.4
+        (19.9, 10.0, 110),  # 101.01
+        (20.1, 10.0, 0),  # enough
+        (1.6, 1.0, 250),  # by the least gain: 100 * 4 / 1.6, and by its error 156
+        (-15.1, 10.0, 0),
+        (0.0, 0.0, 0),
+    ],
+)
+def test_how_many_samples_would_settle_a_gain_that_is_nearly_enough(gain, error, wanted) -> None:
+    assert enough_samples(gain, error, 100, SETTINGS) == wanted
+
+
+def test_what_nearly_helps_is_called_so_and_not_added() -> None:
+    gains = np.random.default_rng(0).standard_normal(400)
+    error = block_standard_error(gains)[0]
+    same = np.ones(400)
+    for share, decision in ((1.4, "rejected"), (1.7, "nearly"), (2.3, "rejected")):
+        shifted = gains - gains.mean() + share * error / 400
+        found = judged_noise(shifted, same, same)
+        assert found.helps is (share > 2.0)
+        assert found.attempt.decision == decision  # what helps is decided among all that does
+        # 400 (2 / 1.7)^2 = 553.6
+        assert ("about 560 samples like these 400" in found.attempt.reason) is (share == 1.7)
+    worse = judged_noise(gains - gains.mean() + 1.7 * error / 400, 1.5 * same, same)
+    assert worse.attempt.decision == "rejected"
 
 
 def test_one_outlier_does_not_hide_what_all_samples_gain() -> None:

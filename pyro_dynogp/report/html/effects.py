@@ -27,7 +27,12 @@ if TYPE_CHECKING:
     from pyro_dynogp.statistics.evidence import Curve
 
 _NOTHING_ADDED = "Nothing was added: the model is the one that was given."
-_ORDER = {"accepted": 0, "tie": 1, "reported": 2, "undecided": 3, "rejected": 4, "not tried": 5}
+_ORDER = {
+    name: place
+    for place, name in enumerate(
+        ("accepted", "tie", "reported", "undecided", "nearly", "rejected", "not tried")
+    )
+}
 
 
 def effects(report: LoopResult) -> str:
