@@ -33,6 +33,11 @@ from pyro_dynogp.cli.options import CHANNELS, PAIRS, WORK, seed
     "--max-rounds", type=click.IntRange(min=1), default=4, show_default=True,
     help="Most effects that are added, one in each round.",
 )  # fmt: skip
+@click.option(
+    "--time-limit", type=click.FloatRange(min=0.0, min_open=True), metavar="SECONDS",
+    help="After this time no round and no refit of the search begins; the report says what was "
+    "not tried. No limit if not given.",
+)  # fmt: skip
 @seed("report")
 @click.option(
     "--out", type=click.Path(file_okay=False, path_type=Path), default=Path("close_loop_output"),
@@ -47,6 +52,7 @@ def close_loop(
     pairs: int,
     restarts: int | None,
     max_rounds: int,
+    time_limit: float | None,
     seed: int,
     out: Path,
     workers: int | None,
@@ -57,7 +63,8 @@ def close_loop(
 
     DATA is a CSV file or the name of a data set. A model is fitted to the first half of it; the
     next quarter is searched for effects, and the last quarter is opened once, for the report.
-    Writes report.html (a page for people), report.json and model.safetensors.
+    Writes report.html (a page for people), report.json and model.safetensors: the extended model,
+    or the model before where the extended one does worse on the last quarter.
 
     \b
     Examples:
@@ -92,6 +99,7 @@ def close_loop(
         candidates=None,
         seed=seed,
         max_rounds=max_rounds,
+        time_limit=time_limit,
         workers=workers,
         progress=not quiet,
     )
@@ -100,4 +108,6 @@ def close_loop(
     report.to_json(out / "report.json")
     model = saved(report.fit, out / "model.safetensors")
     click.echo(f"\nReport: {out / 'report.html'} (numbers: {out / 'report.json'})")
-    click.echo(f"Model:  {model} (pyro_dynogp.load reads it)")
+    which = "the model before" if report.model_kept else "the extended model"
+    which = which if report.extended is not report.base else "the model as given"
+    click.echo(f"Model:  {model} ({which}; pyro_dynogp.load reads it)")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -12,10 +12,11 @@ import numpy as np
 from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.blocks import Blocks, shared
-from pyro_dynogp.discrepancy.decision import Confirmed, certain, confirm
+from pyro_dynogp.discrepancy.decision import Confirmed, confirm
+from pyro_dynogp.discrepancy.held_out import forecast_density, forecast_errors, without
+from pyro_dynogp.discrepancy.judged import certain
 from pyro_dynogp.discrepancy.residuals import residuals_of
 from pyro_dynogp.discrepancy.search import Found, look, rated
-from pyro_dynogp.discrepancy.trials import forecast_density, forecast_errors, without
 from pyro_dynogp.effects import Effect
 from pyro_dynogp.inference.refit import refit
 from pyro_dynogp.inference.run import Run
@@ -34,11 +35,16 @@ if TYPE_CHECKING:
 
 
 class Stopwatch:
-    """Seconds by stage."""
+    """Seconds by stage, and whether a limit of all of them together has passed."""
 
-    def __init__(self) -> None:
+    def __init__(self, limit: float | None = None) -> None:
         self.seconds: dict[str, float] = {}
-        self._last = time.perf_counter()
+        self.limit = limit
+        self._begin = self._last = time.perf_counter()
+
+    def late(self) -> bool:
+        """Whether more than the limit has passed since the watch was made."""
+        return self.limit is not None and time.perf_counter() - self._begin > self.limit
 
     def stop(self, stage: str) -> None:
         """Add the time since the last stop to a stage."""
@@ -70,6 +76,7 @@ class SearchContext:
     Attributes:
         data: blocks. names: of candidate channels.
         seed, level, tries, effects, workers, progress, settings: as of `close_loop`.
+        late: says whether the time limit has passed; None for none.
         held_out: (n,) samples of the known blocks that no fit of a round sees.
     """
 
@@ -82,6 +89,7 @@ class SearchContext:
     workers: int | None
     progress: bool
     settings: LoopSettings
+    late: Callable[[], bool] | None = None
     held_out: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
@@ -193,7 +201,7 @@ class SearchContext:
         return confirm(
             chosen, current, self.data.known, self.held_out, number=number,
             seed=self.seed, level=self.level, settings=self.settings, workers=self.workers,
-            progress=self.progress,
+            progress=self.progress, late=self.late,
         )  # fmt: skip
 
     def beyond(self, residuals: Sequence[Residuals]) -> list[Beyond]:
@@ -244,10 +252,11 @@ class SearchContext:
         self.held_out = shared(self.held_out, self.settings.stretches)
         return True
 
-    def left(self, looked: Tested) -> tuple[str, ...]:
+    def left(self, looked: Tested) -> tuple[tuple[str, ...], Sequence[float]]:
         """What is left, in words: empty where nothing is.
 
-        By the tests of single effects, all paid for, or else by the omnibus test.
+        By the tests of single effects, all paid for, or else by the omnibus test, whose p-value for
+        each output, paid for by their number, comes second.
         """
         named: dict[str, float] = {}
         for one in looked.found:  # an effect has several pieces of evidence, the best one first
@@ -255,9 +264,11 @@ class SearchContext:
                 named.setdefault(one.effect.name, one.q_value)
         if named:
             rates = ", ".join(f"{name} ({q:.2g})" for name, q in named.items())
-            return (f"Residual tests speak for (false discovery rate): {rates}.",)
+            return (f"Residual tests speak for (false discovery rate): {rates}.",), ()
         omnibus = [
             structure_left(one, self.settings, self.level, plain=other, seed=self.seed)
             for one, other in zip(looked.residuals, looked.whole, strict=True)
         ]
-        return tuple(said for p, said in omnibus if p * len(omnibus) <= self.gate)
+        paid = [min(1.0, p * len(omnibus)) for p, _ in omnibus]
+        said = (words for p, (_, words) in zip(paid, omnibus, strict=True) if p <= self.gate)
+        return tuple(said), paid

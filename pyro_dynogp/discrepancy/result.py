@@ -18,7 +18,15 @@ if TYPE_CHECKING:
     from pyro_dynogp.models.description import Part
     from pyro_dynogp.prediction.prediction import Prediction
 
-Decision = Literal["accepted", "tie", "rejected", "not tried", "reported"]
+Decision = Literal["accepted", "tie", "nearly", "rejected", "undecided", "not tried", "reported"]
+# What became of a test.
+Outcome = Decision | Literal["not significant"]
+# The outcome where what was found does harm on the last block.
+KEPT = "effects named, model kept"
+RELY_ON_BEFORE = (
+    "with them the model does worse on the last block. Rely on the model before (report.fit), not "
+    "on the extended one (report.extended)."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +36,8 @@ class Attempt:
     Attributes:
         round: number, from 1. evidence: of the test. q_value: false discovery rate at which it
             passes among all tests of the round.
-        decision: what became of it. reason: why, in words.
+        decision: what became of it; "nearly" where it is rejected by little, and "undecided" where
+            the time limit came first. reason: why, in words.
         gain, gain_error: elpd of held-out data after less before, and its block standard error
             [nats]; NaN where it was not refitted.
         seconds: that refits took.
@@ -47,6 +56,39 @@ class Attempt:
     def name(self) -> str:
         """Name of the effect."""
         return self.evidence.effect
+
+    @property
+    def channel(self) -> str:
+        """Name of the channel that the effect comes from or acts on, "" where it has none."""
+        return str(self.evidence.where.get("channel", ""))
+
+    @property
+    def output(self) -> str:
+        """Name of the output whose residual was tested, "" where that is not known."""
+        return self.evidence.output
+
+
+@dataclass(frozen=True)
+class EffectTest:
+    """One test of one round, whatever came of it.
+
+    Attributes:
+        round: number, from 1. effect: name. output: whose residual was tested.
+        place: the channel, or else the instant, period, frequency or form that suits best; "" for
+            none.
+        p_value: probability of as much where the effect is absent, paid for by the number of
+            outputs. q_value: false discovery rate among all tests of the round; of "any structure",
+            which is asked by itself where no effect is certain, the p-value.
+        decision: what became of it, as of an `Attempt`; or "not significant".
+    """
+
+    round: int
+    effect: str
+    output: str
+    place: str
+    p_value: float
+    q_value: float
+    decision: Outcome
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,19 +126,25 @@ class LoopResult:
 
     Attributes:
         effects: accepted, in the order in which they were added; then what is only reported.
-        outcome: "effects added", "nothing missing", "structure left, cause unknown" or "effects
-            added, structure left".
+        outcome: "effects added", "nothing missing", "structure left, cause unknown", "effects
+            added, structure left"; "effects named, model kept" where the extended model does
+            clearly worse on block C; "search ended early" and "effects added, search ended early"
+            where the time limit was passed first.
         before, after: scores on the sealed block C of the model given and of the extended one, both
             fitted to A and B: rmse, mae, nrmse, crps, coverage_50, coverage_95.
         elpd_gain, elpd_gain_error: elpd on C after less before, block standard error [nats].
-        fit: the extended fit (the model given where nothing was added), of A and B.
+        fit: the fit to rely on, of A and B: `extended`, but `base` where that does better on C.
         base: the model given, fitted to A and B.
-        attempts: all that was considered. left: what structure is left at the end, in words; empty
-            where none is. warnings: sentences for the reader.
-        data: which part was for what. tests: p-value of each test on C before and after, by effect.
+        extended: the model with all effects that were accepted, fitted to A and B, also where
+            `fit` is the one before; `base` where nothing was added.
+        attempts: all that was considered. tests: every test of every round, most probable effects
+            first. left: what structure is left at the end, in words; empty where none is.
+        warnings: sentences for the reader. data: which part was for what.
+        last_block_tests: smallest p-value on C of the tests for each accepted effect, before and
+            after, by effect.
         sealed: block C. known: blocks A and B.
-        forecast_before, forecast_after: of C.
-        model_before, model_after: the models in words, part by part.
+        forecast_before, forecast_after: of C by `base` and `extended`.
+        model_before, model_after: those models in words, part by part.
         seconds: by stage.
     """
 
@@ -108,11 +156,13 @@ class LoopResult:
     elpd_gain_error: float
     fit: Fit
     base: Fit
+    extended: Fit
     attempts: tuple[Attempt, ...]
+    tests: tuple[EffectTest, ...]
     left: tuple[str, ...]
     warnings: tuple[str, ...]
     data: str
-    tests: Mapping[str, tuple[float, float]]
+    last_block_tests: Mapping[str, tuple[float, float]]
     sealed: Record
     known: Record
     forecast_before: Prediction
@@ -120,6 +170,11 @@ class LoopResult:
     model_before: tuple[Part, ...]
     model_after: tuple[Part, ...]
     seconds: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def model_kept(self) -> bool:
+        """Whether `fit` is the model before, as the extended one does clearly worse on block C."""
+        return self.outcome == KEPT
 
     def to_dict(self) -> dict[str, Any]:
         """Everything but the fits and predictions, as JSON has it."""
@@ -130,8 +185,13 @@ class LoopResult:
             "after": dict(self.after),
             "elpd_gain": self.elpd_gain,
             "elpd_gain_error": self.elpd_gain_error,
-            "tests": {name: list(pair) for name, pair in self.tests.items()},
-            "attempts": [_plain(one) for one in self.attempts],
+            "model_kept": self.model_kept,
+            "last_block_tests": {k: list(pair) for k, pair in self.last_block_tests.items()},
+            "attempts": [
+                _plain(one) | {"channel": one.channel, "output": one.output}
+                for one in self.attempts
+            ],
+            "tests": [_plain(one) for one in self.tests],
             "left": list(self.left),
             "warnings": list(self.warnings),
             "data": self.data,
@@ -146,7 +206,7 @@ class LoopResult:
         Path(path).write_text(text + "\n", encoding="utf-8")
 
     def __str__(self) -> str:
-        lines = [f"{self.outcome[:1].upper()}{self.outcome[1:]}."]
+        lines = [self.headline]
         for k, one in enumerate(self.effects, 1):
             lines.append(f"{k}. {one.name}: {one.sentence}")
             lines += [f"   {name}: {mean:.4g} +- {sd:.2g}" for name, (mean, sd) in
@@ -161,10 +221,16 @@ class LoopResult:
         lines.append(f"elpd         after less before {gain:.1f} +- {error:.1f} nats")
         return "\n".join([*lines, *self.left, *self.warnings])
 
+    @property
+    def headline(self) -> str:
+        """The outcome as a sentence; where the extended model does harm, which one to rely on."""
+        said = f"{self.outcome[:1].upper()}{self.outcome[1:]}"
+        return f"{said}: {RELY_ON_BEFORE}" if self.model_kept else f"{said}."
+
 
 def _plain(one: Any) -> Any:
     """Dataclasses, arrays and mappings as JSON has them."""
-    if isinstance(one, Attempt | FoundEffect | Evidence | Curve):
+    if isinstance(one, Attempt | EffectTest | FoundEffect | Evidence | Curve):
         return {name: _plain(getattr(one, name)) for name in one.__dataclass_fields__}
     if isinstance(one, np.ndarray):
         return one.tolist()

@@ -73,7 +73,14 @@ def look(
         f"Not tested for {', '.join(dict.fromkeys(names))}: {why}" for why, names in reasons.items()
     ]
     found = [
-        (task.effect, replace(one, p_value=min(1.0, one.p_value * len(residuals))))
+        (
+            task.effect,
+            replace(
+                one,
+                p_value=min(1.0, one.p_value * len(residuals)),
+                output=task.residuals.output_name,
+            ),
+        )
         for task, several in zip(tasks, looked, strict=True)
         if not isinstance(several, str)
         for one in several

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.context import SearchContext, Stopwatch, Tested
 from pyro_dynogp.discrepancy.data_faults import data_spikes
-from pyro_dynogp.discrepancy.decision import Confirmed
-from pyro_dynogp.discrepancy.result import Attempt
+from pyro_dynogp.discrepancy.decision import LATE, Confirmed
+from pyro_dynogp.discrepancy.result import Attempt, EffectTest, Outcome
 from pyro_dynogp.discrepancy.search import Candidate, Found, candidates_of
 from pyro_dynogp.effects.base import OUTSIDE
 from pyro_dynogp.models.variants import Model, has_process_noise
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 FED_BACK = "inputs are under feedback, for which the residual speaks more clearly"
 OTHERS = "others are more probable, or no block of the model stands for it"
+ANY = "any structure"
+OVER = "the most effects that may be added are added"
 
 
 @dataclass(eq=False)
@@ -41,8 +43,10 @@ class SearchState:
         returned: whether rounds began again with it.
         number: of rounds so far.
         accepted: effects in order. seen: residuals before each of them was added.
-        attempts: what was tried. reported: what no block mends, by the last tests.
+        attempts: what was tried. tests: all tests, whatever came of them.
+        reported: what no block mends, by the last tests.
         left: what is left, in words, by the last tests. notes: what else there is to say.
+        early: whether the time limit was passed before the search came to its end.
     """
 
     rounds: SearchContext
@@ -58,10 +62,13 @@ class SearchState:
     accepted: list[tuple[Found, Confirmed]] = field(default_factory=list)
     seen: list[Sequence[Residuals]] = field(default_factory=list)
     attempts: list[Attempt] = field(default_factory=list)
+    tests: list[EffectTest] = field(default_factory=list)
     reported: list[Found] = field(default_factory=list)
     left: tuple[str, ...] = ()
     notes: list[str] = field(default_factory=list)
+    early: bool = False
     _looked: Tested | None = None
+    _omnibus: Sequence[float] = ()
 
     def __post_init__(self) -> None:
         self.plain = self.rounds.plain(self.first)
@@ -80,26 +87,38 @@ class SearchState:
                 *_spikes(looked.residuals, self.rounds.data.known, self.rounds.settings),
                 *looked.notes,
             ]
-        rounds, known = self.rounds, self.rounds.data.known
-        chosen: list[Candidate] = []
-        if self.left:
-            open_loop = [f for f in looked.found if not self._is_fed_back(f)]
-            chosen = candidates_of(
-                open_loop, self.model, known, rounds.level, rounds.tries, rounds.settings
-            )
-        self.attempts += self._untried(looked.found, chosen)
-        if chosen:
-            confirmed = rounds.confirm(chosen, self.current, self.number)
+        rounds, chosen = self.rounds, self._chosen(looked)
+        attempts = self._untried(looked.found, chosen, OTHERS)
+        confirmed = rounds.confirm(chosen, self.current, self.number) if chosen else None
+        if confirmed is not None:
             self.watch.stop("refits")
-            self.attempts += confirmed.attempts
-            if confirmed.winner is not None and confirmed.model is not None:
-                self._add(confirmed.winner, confirmed, confirmed.model, looked)
-                return True
-        if not (self.left and self.quiet) or self.accepted:
+            attempts += confirmed.attempts
+            self.early = confirmed.early
+        self._list(looked.found, attempts)
+        if confirmed is not None and confirmed.winner is not None:
+            self._add(confirmed.winner, confirmed, looked)
+            return True
+        if not (self.left and self.quiet) or self.accepted or self.early:
             return False
         self._go_on_from(self.first)
         self.quiet, self.returned = False, True
         return True
+
+    def go_rounds(self, most: int) -> None:
+        """Go rounds until nothing helps, as many effects are added as may be, or time is over."""
+        while not self.stopped() and self.go_round():
+            if len(self.accepted) == most:  # whether something is left is still to be said
+                if not self.stopped():
+                    self.number += 1
+                    self._list(found := self.look().found, self._untried(found, [], OVER))
+                break
+        if not self.early:
+            self.doubt()
+
+    def stopped(self) -> bool:
+        """Whether the time limit was passed before the search came to its end."""
+        self.early = self.early or self.watch.late()
+        return self.early
 
     def look(self) -> Tested:
         """Test the residuals of the model so far."""
@@ -114,7 +133,7 @@ class SearchState:
         self.reported = [
             f for f in looked.found if not f.effect.added and f.q_value <= self.rounds.gate
         ]
-        self.left = self.rounds.left(looked)
+        self.left, self._omnibus = self.rounds.left(looked)
         self._looked = looked
         self.watch.stop("residual tests")
         return looked
@@ -131,6 +150,26 @@ class SearchState:
             for (winner, one), before in zip(self.accepted, self.seen, strict=True)
         ]
         self.watch.stop("residual tests")
+
+    def said_of_time(self) -> list[str]:
+        """That the search ended early, and what was not tried."""
+        if not self.early:
+            return []
+        said = f"The search ended early: the time limit of {self.watch.limit:g} s was passed"
+        if self.number == 0:
+            return [f"{said} before the first round. No residual was tested."]
+        if self._looked is None:
+            return [f"{said} after round {self.number}. What the model leaves since then was not "
+                    "tested."]  # fmt: skip
+        own = [one for one in self.attempts if one.round == self.number]
+        parts = [f"{said} in round {self.number}, which added nothing."]
+        for words, decision in (("Not refitted", "not tried"), ("Not decided", "undecided")):
+            names = dict.fromkeys(
+                one.name for one in own if one.decision == decision and one.reason.endswith(LATE)
+            )
+            if names:
+                parts.append(f"{words}: {', '.join(names)}.")
+        return [" ".join(parts)]
 
     def said_of_hiding(self) -> list[str]:
         """That process noise hides what is missing, and what was done about it."""
@@ -164,14 +203,48 @@ class SearchState:
             and found.evidence.p_value > min(certain)
         )
 
-    def _untried(self, found: Sequence[Found], chosen: Sequence[Candidate]) -> list[Attempt]:
-        """Effects that the residual speaks for, but that were not refitted."""
+    def _chosen(self, looked: Tested) -> list[Candidate]:
+        """Effects that are worth a refit, where anything is left."""
+        rounds = self.rounds
+        if not self.left:
+            return []
+        open_loop = [f for f in looked.found if not self._is_fed_back(f)]
+        return candidates_of(
+            open_loop, self.model, rounds.data.known, rounds.level, rounds.tries, rounds.settings
+        )
+
+    def _list(self, found: Sequence[Found], attempts: Sequence[Attempt]) -> None:
+        """Keep what was tried in a round, and every test of it."""
+        self.attempts += attempts
+        decided: dict[int, Outcome] = {id(one.evidence): one.decision for one in attempts}
+        for f in found:
+            one, level = f.evidence, self.rounds.level
+            passed = bool(self.left) and one.p_value <= level
+            otherwise: Outcome = "not tried" if passed else "not significant"
+            decision: Outcome = decided.get(id(one), otherwise)
+            test = EffectTest(
+                self.number, one.effect, one.output, one.place, one.p_value, f.q_value, decision
+            )
+            self.tests.append(test)
+        names = self.rounds.data.known.output_names
+        self.tests += [
+            EffectTest(
+                self.number, ANY, name, "", p, p,
+                "reported" if p <= self.rounds.gate else "not significant",
+            )
+            for name, p in zip(names, self._omnibus, strict=False)
+        ]  # fmt: skip
+
+    def _untried(
+        self, found: Sequence[Found], chosen: Sequence[Candidate], why: str
+    ) -> list[Attempt]:
+        """Effects that the residual speaks for, but that were not refitted, for a reason."""
         tried = [one for one, _ in chosen]
         attempts = []
         for f in found:
             if f.q_value > self.rounds.level or any(f is one for one in tried):
                 continue
-            attempt = Attempt(self.number, f.evidence, f.q_value, "not tried", OTHERS)
+            attempt = Attempt(self.number, f.evidence, f.q_value, "not tried", why)
             if not f.effect.added:
                 attempt = replace(attempt, decision="reported", reason="is reported, not added")
             elif self._is_fed_back(f):
@@ -179,9 +252,10 @@ class SearchState:
             attempts.append(attempt)
         return attempts
 
-    def _add(self, winner: Found, confirmed: Confirmed, larger: Model, looked: Tested) -> None:
+    def _add(self, winner: Found, confirmed: Confirmed, looked: Tested) -> None:
         """Go on with the model that a winner extends."""
-        rounds = self.rounds
+        rounds, larger = self.rounds, confirmed.model
+        assert larger is not None
         if rounds.doubtful(winner, looked.whole, rounds.beyond(looked.residuals)):
             confirmed = replace(confirmed, ties=(*confirmed.ties, OUTSIDE))
         self.accepted.append((winner, confirmed))
@@ -198,6 +272,7 @@ class SearchState:
 
     def _go_on_from(self, fit: Fit) -> None:
         self.current, self.model = fit, replace(fit.model, scaling=None)
+        self.left, self._looked, self._omnibus = (), None, ()  # they were of another model
 
 
 def _spikes(residuals: Sequence[Residuals], record: Record, settings: LoopSettings) -> list[str]:

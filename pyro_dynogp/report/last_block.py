@@ -11,11 +11,11 @@ from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.context import SearchContext
 from pyro_dynogp.discrepancy.decision import Confirmed
+from pyro_dynogp.discrepancy.held_out import one_step_density
 from pyro_dynogp.discrepancy.parameters import parameters_of
-from pyro_dynogp.discrepancy.result import FoundEffect
+from pyro_dynogp.discrepancy.result import KEPT, FoundEffect
 from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.discrepancy.state import SearchState
-from pyro_dynogp.discrepancy.trials import one_step_density
 from pyro_dynogp.effects.base import Effect, experiment
 from pyro_dynogp.models.description import describe, in_words
 from pyro_dynogp.prediction.records import joined
@@ -52,9 +52,9 @@ def report_of(base: Fit, extended: Fit, course: SearchState, warnings: Sequence[
     there = np.isfinite(densities[0])
     gain = densities[1][there] - densities[0][there]
     elpd_gain, elpd_gain_error = float(gain.sum()), block_standard_error(gain)[0]
-    unpaid: list[str] = []
+    harm: list[str] = []
     if accepted:
-        unpaid = does_not_pay(before, after, elpd_gain, elpd_gain_error, rounds.settings)
+        harm = harm_done(before, after, elpd_gain, elpd_gain_error, rounds.settings)
     watch.stop("scores of the last block")
     tests = _tested([f for f, _ in accepted], (base, extended), whole, sealed, rounds)
     watch.stop("residual tests of the last block")
@@ -62,18 +62,20 @@ def report_of(base: Fit, extended: Fit, course: SearchState, warnings: Sequence[
     watch.stop("numbers of the effects")
     return Report(
         effects=(*effects, *(_only_reported(f) for f in course.reported)),
-        outcome=_outcome(bool(accepted), bool(course.left)),
+        outcome=_outcome(course, bool(harm)),
         before=before,
         after=after,
         elpd_gain=elpd_gain,
         elpd_gain_error=elpd_gain_error,
-        fit=extended,
+        fit=base if harm else extended,
         base=base,
+        extended=extended,
         attempts=tuple(course.attempts),
+        tests=tuple(course.tests),
         left=course.left,
-        warnings=(*warnings, *unpaid),
+        warnings=(*harm, *warnings),
         data=data.sentence,
-        tests=tests,
+        last_block_tests=tests,
         sealed=data.sealed,
         known=data.known,
         forecast_before=forecasts[0],
@@ -84,36 +86,44 @@ def report_of(base: Fit, extended: Fit, course: SearchState, warnings: Sequence[
     )
 
 
-def does_not_pay(
+def harm_done(
     before: Mapping[str, float],
     after: Mapping[str, float],
     gain: float,
     error: float,
     settings: LoopSettings,
 ) -> list[str]:
-    """A warning where forecasts of the last block are worse by both scores, or clearly less likely.
+    """In words, that the extended model does worse on the last block; nothing where it does not.
+
+    It does where the RMSE and the CRPS of its forecasts are more than `settings.worse` times those
+    before, or where it loses more log density than `settings.worse_errors` standard errors.
 
     Args:
         before, after: scores of the forecasts [output].
         gain, error: in log density, with its block standard error [nats].
     """
     worse = all(after[name] > settings.worse * before[name] for name in ("rmse", "crps"))
-    if not worse and gain > -settings.worse_errors * error:
+    if not worse and gain >= -settings.worse_errors * error:
         return []
     scores = ", ".join(
         f"{name.upper()} {before[name]:.3g} -> {after[name]:.3g}" for name in ("rmse", "crps")
     )
     return [
-        f"What was added does not pay on the last block ({scores}, elpd {gain:+.1f} +- {error:.1f} "
-        f"nats): what held-out data speak for need not last. Look at the residuals there, and "
-        f"confirm it on another record before you rely on the extended model."
+        f"What was added does harm on the last block ({scores}, elpd {gain:+.1f} +- {error:.1f} "
+        f"nats): what held-out data speak for need not last. Rely on the model before, which "
+        f"report.fit is; report.extended is the extended one. Look at its residuals there, and "
+        f"confirm what was named on another record before you use it."
     ]
 
 
-def _outcome(added: bool, left: bool) -> str:
-    if added:
-        return "effects added, structure left" if left else "effects added"
-    return "structure left, cause unknown" if left else "nothing missing"
+def _outcome(course: SearchState, harm: bool) -> str:
+    if harm:
+        return KEPT
+    if course.early:
+        return "effects added, search ended early" if course.accepted else "search ended early"
+    if course.accepted:
+        return "effects added, structure left" if course.left else "effects added"
+    return "structure left, cause unknown" if course.left else "nothing missing"
 
 
 def _tested(

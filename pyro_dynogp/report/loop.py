@@ -10,8 +10,8 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.records import one_record
 from pyro_dynogp.discrepancy.blocks import Blocks, blocks_of
 from pyro_dynogp.discrepancy.context import SearchContext, Stopwatch
+from pyro_dynogp.discrepancy.held_out import without
 from pyro_dynogp.discrepancy.state import SearchState
-from pyro_dynogp.discrepancy.trials import without
 from pyro_dynogp.effects import CATALOGUE, Effect
 from pyro_dynogp.fitting import fit as fit_model
 from pyro_dynogp.inference.fitted import known_fit
@@ -48,6 +48,7 @@ def close_loop(
     settings: LoopSettings | None = None,
     workers: int | None = None,
     progress: bool = True,
+    time_limit: float | None = None,
 ) -> Report:
     """Say what a fitted model lacks, add it, and report the error before and after.
 
@@ -64,7 +65,8 @@ def close_loop(
     leaves least open is kept, and the others are reported as ties, and so is a cause that the
     catalogue lacks, where products of inputs or responses that change with time explain far more.
     Rounds end where nothing is left, or nothing helps. An effect that no block mends (feedback) is
-    among the report's effects, after those that were added.
+    among the report's effects, after those that were added. Where the extended model does clearly
+    worse on C, effects are named, and the report's fit is the model before.
 
     Args:
         fit: a fit to one record.
@@ -77,6 +79,9 @@ def close_loop(
         settings: every other threshold; None for the defaults of `LoopSettings`.
         workers: processes; None for all processors, or the cluster of
             ``joblib.parallel_config``. progress: whether to show progress bars.
+        time_limit: of the search [s]; None for none. No round, and no refit, begins after it; a
+            round that it cuts short adds nothing. Last fits and scores come after it, and the
+            report says what was not tried.
 
     Raises:
         ValueError: on blocks that are too short, unknown candidates, numbers that make no sense.
@@ -89,23 +94,22 @@ def close_loop(
         instance("effects", effect, Effect)
     if not isinstance(candidates, Sequence | Record | None.__class__):
         raise invalid("candidates", expected="names, or a Record", got=repr(candidates))
-    watch = Stopwatch()
+    watch = Stopwatch(time_limit)
     other = candidates if isinstance(candidates, Record) else None
     data = blocks_of(fit, record, other, settings)
     names = _names(fit, data.known, candidates)
     # As far up as its extensions will get: what a better climb gains is no effect.
-    rounds = SearchContext(data, names, seed, level, tries, effects, workers, progress, settings)
+    late = None if time_limit is None else watch.late
+    rounds = SearchContext(
+        data, names, seed, level, tries, effects, workers, progress, settings, late
+    )
     first = rounds.refit(_given(fit, data, seed), fit.model)
     course = SearchState(rounds, watch, first)
     watch.stop("fit of block A")
-    while course.go_round():
-        if len(course.accepted) == max_rounds:  # whether something is left is still to be said
-            course.look()
-            break
-    course.doubt()
+    course.go_rounds(max_rounds)
     channels = ("", *data.known.output_names, *names)
     warnings = [fault.sentence for fault in data.faults if fault.channel in channels]
-    warnings += [*course.notes, *course.said_of_hiding()]
+    warnings += [*course.notes, *course.said_of_hiding(), *course.said_of_time()]
     fits = [first, course.current] if course.accepted else [first]
     # The same samples for both, so that they can be compared.
     known = where_inputs_are_known(data.known, longest_delay(course.model))

@@ -8,6 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import pandas as pd
 
+# Entries of `Evidence.where` that say where an effect is, in order of how much they say.
+PLACES = ("channel", "what", "time", "period", "frequency", "low", "form")
+
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
@@ -83,7 +86,7 @@ class Evidence:
         size: root mean square of the fitted effect [output].
         where: what was left open, as found: channel, delay, period, time, limits, ...
         sentence: what it says, in an engineer's words, with units.
-        curve: its picture, or None.
+        curve: its picture, or None. output: name of the output that was tested; the search sets it.
     """
 
     effect: str
@@ -94,3 +97,14 @@ class Evidence:
     where: Mapping[str, float | str] = field(default_factory=dict)
     sentence: str = ""
     curve: Curve | None = None
+    output: str = ""
+
+    @property
+    def place(self) -> str:
+        """The channel, or else the instant, period, ... that suits best, in words; "" for none."""
+        for name in PLACES:
+            value = self.where.get(name)
+            if value not in (None, ""):
+                said = f"{value:.4g}" if isinstance(value, float) else str(value)
+                return said if name in ("channel", "what") else f"{name.replace('_', ' ')} {said}"
+        return ""

@@ -18,15 +18,17 @@ class LoopSettings:
         standard_errors: block standard errors that such a gain must exceed.
             Evidence: coverage of the error under autocorrelation is measured in the tests of
             `criticism.comparison`; 1 and 3 judge 9 and 6 of 114 stored refits otherwise.
+        nearly: block standard errors from which a gain that is not enough is called nearly so.
+            Evidence: convention: of gains of nothing 4 % lie between 1.5 and 2 errors.
         cap: most that one sample counts for where the plain sum is not certain [nats].
             Evidence: reason: an outlier makes the standard error as large as the sum; half and
             double of it judge none of 114 stored refits otherwise.
         special: share of a gain that a special case of an effect may lack and still be named.
             Evidence: reason: what is left are differences of fits; half and double of it name
             the same effect for all 114 stored refits.
-        harm: share of the mean absolute error of forecasts that an effect of the noise may cost.
+        harm: share of the mean absolute error of forecasts that an effect may cost.
             Evidence: reason: other weights of samples move a model a little; half and double of
-            it judge none of 114 stored refits otherwise.
+            it judge none of 114 stored refits otherwise, of which those of the noise had errors.
         outside: how many times as much a cause outside the catalogue must explain before an effect
             is doubted. Evidence: counted once, by an earlier version whose rows are not kept: of 15
             development plants with an effect of the catalogue it explained at most 1.03 times as
@@ -36,10 +38,14 @@ class LoopSettings:
             Evidence: half and double of it add the same effect to 21 stored records.
         gate: share of `level` for each of the two answers to whether anything is left.
             Evidence: two tests, Bonferroni.
-        worse: ratio of scores of the last block from which a report warns.
+        worse: ratio of errors after to before from which effects do harm: on the last block (by
+            RMSE and CRPS), so that the report keeps the model before; and of a line in time to
+            the last level held (by RMSE), beyond which it is not added.
             Evidence: reason: effects of the noise change scores by chance.
-        worse_errors: standard errors of a loss of log density from which a report warns.
-            Evidence: convention.
+        worse_errors: standard errors of a loss of log density on the last block from which effects
+            do harm. Evidence: convention.
+        level_samples: over which the last level is averaged that a drift is held at.
+            Evidence: reason: white noise of ten samples averages to a third.
         block_samples: fewest samples of the block that is searched and of the one reported on.
             Evidence: none.
         measured_samples: fewest measured samples of those blocks, and of whatever is tested.
@@ -93,6 +99,7 @@ class LoopSettings:
 
     gain: float = 4.0
     standard_errors: float = 2.0
+    nearly: float = 1.5
     cap: float = 10.0
     special: float = 0.05
     harm: float = 0.05
@@ -101,6 +108,7 @@ class LoopSettings:
     gate: float = 0.5
     worse: float = 1.05
     worse_errors: float = 2.0
+    level_samples: int = 10
     block_samples: int = 60
     measured_samples: int = 30
     fit_share: float = 0.5

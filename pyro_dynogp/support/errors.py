@@ -132,7 +132,7 @@ RULES = {
     "seed": Rule("a whole number from 0 to 2**63 - 1", whole(0, 2**63 - 1).plain),
     "level": SHARE,
     **dict.fromkeys(("learning_rate", "init_scale", "joint_scale", "gain_scale", "step", "duration",
-                     "degrees_of_freedom"), POSITIVE),
+                     "degrees_of_freedom", "time_limit"), POSITIVE),
     **dict.fromkeys(("path", "checkpoint"), PATH),
     "integrators": Rule("0 or 1", whole(0, 1).plain),
     "name": Rule("text", lambda value: value if isinstance(value, str) else None),

@@ -18,6 +18,7 @@ import pandas as pd
 
 import pyro_dynogp as dgp
 from pyro_dynogp.data.channels import Calendar
+from pyro_dynogp.discrepancy.result import KEPT
 from pyro_dynogp.examples import datasets
 
 # Half-hours that are averaged, days of Melbourne's pleasant temperature [degC].
@@ -141,6 +142,11 @@ def one(name: str, rounds: int = 3) -> dict[str, Any]:
     }
 
 
+def _said(found: str, outcome: str) -> str:
+    """What was found, or the outcome; both where the model before is kept."""
+    return f"{found} ({outcome})" if outcome == KEPT else found or outcome
+
+
 def run(folder: Path, names: Sequence[str] | None = None) -> str:
     """All cases, or some; each is also kept as JSON."""
     lines = [
@@ -158,7 +164,7 @@ def run(folder: Path, names: Sequence[str] | None = None) -> str:
             e[0] + (f" (or {', '.join(e[2])})" if e[2] else "") for e in row["effects"]
         )
         lines.append(
-            f"| {name} | {row['missing']} | {found or row['outcome']} | "
+            f"| {name} | {row['missing']} | {_said(found, row['outcome'])} | "
             f"{before['rmse']:.4g}, {after['rmse']:.4g} | {before['crps']:.4g}, "
             f"{after['crps']:.4g} | {before['coverage_95']:.2f}, {after['coverage_95']:.2f} | "
             f"{row['gain'][0]:+.1f} ± {row['gain'][1]:.1f} | "

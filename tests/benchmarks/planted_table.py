@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy import stats
 
+from pyro_dynogp.discrepancy.result import KEPT
 from tests.benchmarks.circumstances import sentence
 from tests.benchmarks.markdown import table
 from tests.discrepancy.plants import CATALOGUE, OUTSIDE, STRENGTHS
@@ -59,6 +60,12 @@ def is_right(row: Row) -> bool:
 
 def _right_name(effect: str) -> str:
     return UNKNOWN if effect == OUTSIDE else effect
+
+
+def relied_on(row: Row) -> Mapping[str, float]:
+    """Scores of the fit that a report says to rely on: where effects do harm, the model before."""
+    scores: Mapping[str, float] = row["before" if row["outcome"] == KEPT else "after"]
+    return scores
 
 
 def is_found(row: Row) -> bool:
@@ -120,11 +127,17 @@ def _null_sentences(rows: Sequence[Row]) -> str:
     decoys = sum("decoy" in _named(row) for row in rows)
     share = [row for row in rows if row["effect"] not in (NOTHING, OUTSIDE)]
     right = sum(is_right(row) for row in share)
+    kept = sum(row["outcome"] == KEPT for row in rows)
+    harm = (  # rows of before there was such an outcome say nothing of it
+        f"The model before was kept in {_share(kept, len(rows))}, as the extended one did worse on "
+        "the sealed block. "
+        if kept else ""
+    )  # fmt: skip
     return (
         f"Null plants: an effect accepted in {_share(accepted, len(null))}, accepted or reported "
         f"in {_share(named, len(null))}. A decoy channel accepted in {_share(decoys, len(rows))} "
-        f"of all plants. The planted effect named first in {_share(right, len(share))}. Intervals "
-        "are 95 %, by Clopper and Pearson."
+        f"of all plants. The planted effect named first in {_share(right, len(share))}. {harm}"
+        "Intervals are 95 %, by Clopper and Pearson."
     )
 
 
@@ -153,7 +166,10 @@ def _confusion_table(rows: Sequence[Row]) -> str:
 
 
 def _strength_table(rows: Sequence[Row]) -> str:
-    """Shares that are right, and errors over the floor before and after, in the median."""
+    """Shares that are right, and errors over the floor before and after, in the median.
+
+    Errors after are those of the fit to rely on.
+    """
     head = ["effect", "strength", "plants", "right", "found", "wider", "rmse before / floor",
             "after / floor", "after, where right", "coverage 95 % after"]  # fmt: skip
     lines = []
@@ -169,13 +185,16 @@ def _strength_table(rows: Sequence[Row]) -> str:
                     for what in (is_right, is_found, is_wider)
                 ), _over_floor(own, "before"), _over_floor(own, "after"),
                  _over_floor(right, "after"),
-                 _median(own, lambda row: row["after"]["coverage_95"])]
+                 _median(own, lambda row: relied_on(row)["coverage_95"])]
             )  # fmt: skip
     return table(head, lines)
 
 
 def _over_floor(rows: Sequence[Row], when: str) -> str:
-    return _median(rows, lambda row: row[when]["rmse"] / row["floor"])
+    def scores(row: Row) -> Mapping[str, float]:
+        return relied_on(row) if when == "after" else row[when]  # type: ignore[no-any-return]
+
+    return _median(rows, lambda row: scores(row)["rmse"] / row["floor"])
 
 
 def _median(rows: Sequence[Row], value: Callable[[Row], float]) -> str:

@@ -22,6 +22,8 @@ import numpy as np
 import pyro_dynogp as dgp
 from pyro_dynogp import LoopSettings
 from pyro_dynogp.discrepancy import context, decision, search, state
+from pyro_dynogp.discrepancy import refits as refitting
+from pyro_dynogp.discrepancy.judged import certain, loss_of
 from tests.benchmarks.markdown import table
 from tests.benchmarks.planted import Case, study
 
@@ -81,8 +83,8 @@ def record(plants: tuple[Case, ...] = PLANTS) -> Study:
 
 def _recorders(kept: Study, number: int) -> Iterator[tuple[Any, str, Any]]:
     """Functions of the loop, each with one that does the same and keeps what it came to."""
-    Context, Refits = context.SearchContext, decision._Refits
-    judge, run, confirm = decision._judge, Refits.run, Context.confirm
+    Context, Refits = context.SearchContext, refitting.Refits
+    judge, run, confirm = refitting.judge, Refits.run, Context.confirm
     doubtful, look = Context.doubtful, Context.look
     judged, done = set[str](), dict[Any, Any]()
     given: list[Any] = []
@@ -91,7 +93,7 @@ def _recorders(kept: Study, number: int) -> Iterator[tuple[Any, str, Any]]:
         row = {"plant": number, "effect": found.effect.name, "special_of": found.effect.special_of}
         key = f"{row}{found.evidence.where}{kind}"
         if not (tried.failure or base.failure or key in judged):
-            losses = decision._loss(tried.errors, base.errors) if len(tried.errors) else np.zeros(0)
+            losses = loss_of(tried.errors, base.errors) if len(tried.errors) else np.zeros(0)
             kept.refits.append(row | {"gains": tried.densities - base.densities, "losses": losses})
             judged.add(key)
         return judge(found, kind, tried, base, *rest)
@@ -134,7 +136,7 @@ def _recorders(kept: Study, number: int) -> Iterator[tuple[Any, str, Any]]:
             kept.evidence.extend(_named(self, looked, number))
         return looked
 
-    yield decision, "_judge", judging
+    yield refitting, "judge", judging
     yield Refits, "run", running
     yield state, "candidates_of", choosing
     yield Context, "confirm", confirming
@@ -191,10 +193,8 @@ def load(path: Path = KEPT) -> Study:
 def helps(refit: dict[str, Any], settings: LoopSettings) -> bool:
     """Whether a candidate counts as a help."""
     gains, losses = refit["gains"], refit["losses"]
-    enough = decision.certain(gains, settings) or decision.certain(
-        np.minimum(gains, settings.cap), settings
-    )
-    harms = len(losses) and decision.certain(losses, settings)
+    enough = certain(gains, settings) or certain(np.minimum(gains, settings.cap), settings)
+    harms = len(losses) and certain(losses, settings)
     return bool(enough and not (harms and losses.mean() > settings.harm))
 
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.discrepancy.result import Attempt, FoundEffect
+from pyro_dynogp.discrepancy.result import Attempt, EffectTest, FoundEffect
 from pyro_dynogp.models.description import Part
 from pyro_dynogp.prediction.prediction import Prediction
 from pyro_dynogp.report.report import Report
@@ -114,6 +114,14 @@ def attempts():
     )  # fmt: skip
 
 
+def tests():
+    return (
+        EffectTest(1, "extra input", "level", "ambient", 2e-5, 0.0004, "accepted"),
+        EffectTest(1, "level shift", "level", "time 31.5", 0.31, 1.0, "not significant"),
+        EffectTest(2, "any structure", "level", "", 0.74, 0.74, "not significant"),
+    )
+
+
 def report(n=400, outputs=1, seed=0, **changes):
     """Two effects found."""
     whole = record(n, outputs=outputs, seed=seed)
@@ -129,12 +137,12 @@ def report(n=400, outputs=1, seed=0, **changes):
         "after": {"rmse": rmse[1], "mae": mae[1], "nrmse": 0.29, "crps": 0.12, "coverage_50": 0.49,
                   "coverage_95": 0.94},
         "elpd_gain": 61.2, "elpd_gain_error": 9.8,
-        "fit": SimpleNamespace(), "base": SimpleNamespace(),
-        "attempts": attempts(),
+        "fit": SimpleNamespace(), "base": SimpleNamespace(), "extended": SimpleNamespace(),
+        "attempts": attempts(), "tests": tests(),
         "left": (),
         "warnings": ("The inputs hardly excite frequencies above 0.2 rad/s.",),
         "data": "Fitted to 200 samples, searched on the 100 after them, reported on the last 100.",
-        "tests": {"extra input: ambient": (0.0004, 0.41), "dead time": (0.02, 0.33),
+        "last_block_tests": {"extra input: ambient": (0.0004, 0.41), "dead time": (0.02, 0.33),
                   "process noise": (0.01, 0.02), "calendar": (0.6, 0.5),
                   "heavy tails": (0.2, 0.04)},
         "sealed": sealed, "known": known,
@@ -151,7 +159,7 @@ def nothing(**changes):
     same = {
         "effects": (), "outcome": "nothing missing", "after": made.before, "elpd_gain": 0.0,
         "elpd_gain_error": 0.0, "attempts": made.attempts[:1], "warnings": (),
-        "tests": {"calendar": (0.6, 0.6)}, "forecast_after": made.forecast_before,
+        "last_block_tests": {"calendar": (0.6, 0.6)}, "forecast_after": made.forecast_before,
         "model_after": GIVEN,
     }  # fmt: skip
     return report(**(same | changes))

@@ -10,6 +10,7 @@ from click.testing import CliRunner
 
 import pyro_dynogp as dgp
 from pyro_dynogp.cli import main
+from pyro_dynogp.discrepancy.result import KEPT
 from tests.discrepancy import reports
 
 COLUMNS = ["--input", "valve", "--output", "level", "--sampling-time", "0.5"]
@@ -80,7 +81,7 @@ def test_end_to_end(folder, seen, tmp_path):
     out = tmp_path / "a" / "report"
     result = run(
         folder / "plant.csv", *COLUMNS, *QUICK, "--unit", "level=m", "--unit", "ambient=K",
-        "--seed", 3, "--max-rounds", 2, "--out", out,
+        "--seed", 3, "--max-rounds", 2, "--time-limit", 90, "--out", out,
     )  # fmt: skip
     assert result.exit_code == 0, result.output
     record, fitted = seen["record"], seen["fit"]
@@ -93,6 +94,8 @@ def test_end_to_end(folder, seen, tmp_path):
     assert fitted.model.layers[0].pairs == 1
     assert (seen["seed"], seen["rounds"], seen["candidates"]) == (3, 2, None)
     assert (seen["workers"], seen["progress"]) == (1, False)
+    assert seen["time_limit"] == 90.0
+    assert "(the extended model; pyro_dynogp.load reads it)" in result.stdout
     report = reports.report(fit=fitted, base=fitted)
     assert str(report) in result.stdout
     assert "stamp, shift, spare" in result.stderr
@@ -119,8 +122,23 @@ def test_named_candidates_and_time_stamps(folder, seen, unfitted, tmp_path):
     assert (tmp_path / "model.safetensors").read_bytes() == b"fit"
 
 
+@pytest.mark.parametrize(
+    ("changes", "which"),
+    [({"outcome": KEPT}, "the model before"), ({"extended": None}, "the model as given")],
+)
+def test_which_model_is_kept_is_said(changes, which, monkeypatch, unfitted, tmp_path):
+    def close_loop(fit, record, **options):
+        return reports.report(**{"fit": fit, "base": None, "extended": fit, **changes})
+
+    monkeypatch.setattr(dgp, "close_loop", close_loop, raising=False)
+    result = run("gas_furnace", "--out", tmp_path)
+    assert result.exit_code == 0, result.output
+    assert f"({which}; pyro_dynogp.load reads it)" in result.stdout
+
+
 def test_a_data_set(seen, unfitted, tmp_path):
     result = run("gas_furnace", "--out", tmp_path)
+    assert seen["time_limit"] is None
     assert result.exit_code == 0, result.output
     assert len(seen["record"]) == 296
     assert len(unfitted[0][1]) == 148
@@ -139,6 +157,7 @@ def test_a_data_set(seen, unfitted, tmp_path):
         (["missing.csv", *COLUMNS], ["missing.csv", "neither a file"]),
         (["plant.csv", *COLUMNS, "--model", "hammer"], ["--model", "wiener"]),
         (["plant.csv", *COLUMNS, "--max-rounds", "0"], ["--max-rounds"]),
+        (["plant.csv", *COLUMNS, "--time-limit", "0"], ["--time-limit"]),
         (["plant.csv", *COLUMNS, "--out", "plant.csv"], ["--out"]),
         (["wh_process_noise"], ["wh_process_noise", "one record"]),
         (["gas_furnace", "--candidates", "wind"], ["--candidates", "wind"]),

@@ -12,18 +12,14 @@ from scipy.stats import binom
 
 import pyro_dynogp as dgp
 from pyro_dynogp import effects
+from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.data.channels import Calendar, Delayed, ShiftedClock
 from pyro_dynogp.discrepancy.blocks import shared
-from pyro_dynogp.discrepancy.decision import (
-    _first_in_line,
-    _judge,
-    _Judged,
-    _specific,
-    _too_special,
-    confirm,
-)
+from pyro_dynogp.discrepancy.decision import _first_in_line, _specific, _too_special, confirm
+from pyro_dynogp.discrepancy.held_out import interleaved, stretches
+from pyro_dynogp.discrepancy.judged import Judged, enough_samples, judge
 from pyro_dynogp.discrepancy.search import Found
-from pyro_dynogp.discrepancy.trials import Tried, interleaved, stretches
+from pyro_dynogp.discrepancy.trials import Tried
 from pyro_dynogp.statistics.evidence import Evidence
 from pyro_dynogp.statistics.settings import LoopSettings
 from tests.discrepancy.made import SETTINGS
@@ -41,15 +37,15 @@ def tried(gains: np.ndarray, **options: Any) -> Tried:
     return Tried(MODEL, gains, 0.0, **options)
 
 
-def helping(effect: effects.Effect, p: float, q: float, gain: float = 50.0) -> _Judged:
+def helping(effect: effects.Effect, p: float, q: float, gain: float = 50.0) -> Judged:
     n = 100
     kind = ("after", effect.score)
     noise = np.random.default_rng(0).normal(0.0, 0.1, n)
     found = spoken_for(effect, p, q)
-    return _judge(found, kind, tried(noise + gain / n), tried(np.zeros(n)), 1, SETTINGS)
+    return judge(found, kind, tried(noise + gain / n), tried(np.zeros(n)), 1, SETTINGS)
 
 
-def names(judged: list[_Judged]) -> list[str]:
+def names(judged: list[Judged]) -> list[str]:
     return [one.found.effect.name for one in judged]
 
 
@@ -101,11 +97,11 @@ def test_a_special_case_gives_its_name_where_it_is_certain_or_alone(q, others, t
     assert _too_special(found, others, 0.05) == too_special
 
 
-def judged_noise(gains: np.ndarray, errors: np.ndarray, before: np.ndarray) -> _Judged:
+def judged_noise(gains: np.ndarray, errors: np.ndarray, before: np.ndarray) -> Judged:
     """A candidate for the noise with gains (N,), and errors of forecasts before and after."""
     found = spoken_for(effects.HeavyTails(), 1e-9, 1e-8)
     base = tried(0.0 * gains, errors=before[:, None])
-    return _judge(
+    return judge(
         found, ("after", "one step"), tried(gains, errors=errors[:, None]), base, 1, SETTINGS
     )
 
@@ -123,6 +119,49 @@ def test_noise_that_costs_the_forecasts_does_not_help() -> None:
     assert judged_noise(gains, wild, wild).helps
     missing = np.where(np.arange(100) % 3 == 0, np.nan, 1.5 * before)
     assert not judged_noise(gains, missing, missing / 1.5).helps
+
+
+def test_structure_that_costs_the_forecasts_does_not_help() -> None:
+    """Densities of forecasts may rise, as where their sds grow, and errors all the same."""
+    found = spoken_for(effects.Drift(), 1e-9, 1e-8)
+    before = 3.0 * np.resize([1.0, -1.0], 100)[:, None]
+    base = tried(np.zeros(100), errors=before)
+    for ratio, helps in ((0.5, True), (1.04, True), (1.06, False), (3.0, False)):
+        more = tried(np.ones(100), errors=ratio * before)
+        judged = judge(found, ("after", "forecast"), more, base, 1, SETTINGS)
+        assert judged.helps is helps
+        assert ("forecasts worse by" in judged.attempt.reason) is not helps
+
+
+@pytest.mark.parametrize(
+    ("gain", "error", "wanted"),
+    [
+        (14.9, 10.0, 0),
+        (15.1, 10.0, 180),  # 100 (20 / 15.1)^2 = 175.4
+        (19.9, 10.0, 110),  # 101.01
+        (20.1, 10.0, 0),  # enough
+        (1.6, 1.0, 250),  # by the least gain: 100 * 4 / 1.6, and by its error 156
+        (-15.1, 10.0, 0),
+        (0.0, 0.0, 0),
+    ],
+)
+def test_how_many_samples_would_settle_a_gain_that_is_nearly_enough(gain, error, wanted) -> None:
+    assert enough_samples(gain, error, 100, SETTINGS) == wanted
+
+
+def test_what_nearly_helps_is_called_so_and_not_added() -> None:
+    gains = np.random.default_rng(0).standard_normal(400)
+    error = block_standard_error(gains)[0]
+    same = np.ones(400)
+    for share, decision in ((1.4, "rejected"), (1.7, "nearly"), (2.3, "rejected")):
+        shifted = gains - gains.mean() + share * error / 400
+        found = judged_noise(shifted, same, same)
+        assert found.helps is (share > 2.0)
+        assert found.attempt.decision == decision  # what helps is decided among all that does
+        # 400 (2 / 1.7)^2 = 553.6
+        assert ("about 560 samples like these 400" in found.attempt.reason) is (share == 1.7)
+    worse = judged_noise(gains - gains.mean() + 1.7 * error / 400, 1.5 * same, same)
+    assert worse.attempt.decision == "rejected"
 
 
 def test_one_outlier_does_not_hide_what_all_samples_gain() -> None:

@@ -62,7 +62,7 @@ def test_a_channel_that_acts_is_found_added_and_pays_on_the_sealed_block(found: 
     assert found.outcome == "effects added"
     assert found.after["rmse"] < 0.06 < 2.0 * 0.06 < found.before["rmse"]  # the noise is 0.05
     assert found.elpd_gain > 2.0 * found.elpd_gain_error
-    before, after = found.tests["extra input"]
+    before, after = found.last_block_tests["extra input"]
     assert before < 0.01 < after
     assert found.fit.model.inputs == 2
     assert len(found.sealed) == 120
@@ -108,7 +108,44 @@ def test_nothing_is_added_where_nothing_is_missing() -> None:
     assert report.effects == ()
     assert report.outcome == "nothing missing"
     assert report.before == report.after
-    assert report.fit is report.base
+    assert report.fit is report.base is report.extended
+
+
+def test_every_test_is_listed_where_nothing_is_missing() -> None:
+    """Two channels, a step, the tails of the noise, and whether there is any structure at all."""
+    record = machine(seed=5)
+    report = close(fitted(record), record)
+    listed = {(one.effect, one.place.partition(" ")[0]) for one in report.tests}
+    assert listed == {
+        ("extra input", "heat"), ("extra input", "wind"), ("level shift", "time"),
+        ("heavy tails", ""), ("any structure", ""),
+    }  # fmt: skip
+    assert len(report.tests) == len(listed)
+    for one in report.tests:
+        assert one.output == "y"
+        assert one.round == 1
+        assert one.decision == "not significant"
+        assert 0.0 < one.p_value <= 1.0
+        assert one.q_value > 0.025  # half of the level is what each of the two answers has
+    assert report.last_block_tests == {}
+    rows = report.to_dict()["tests"]
+    assert len(rows) == 5
+    assert set(rows[0]) == {
+        "round", "effect", "output", "place", "p_value", "q_value", "decision"
+    }  # fmt: skip
+
+
+def test_tests_say_what_became_of_them(found: Any) -> None:
+    first = [one for one in found.tests if one.round == 1]
+    decisions = {(one.effect, one.place): one.decision for one in first}
+    assert decisions["extra input", "heat"] == "accepted"
+    assert {one.round for one in found.tests} == {1, 2}  # what the extended model leaves
+    by_name = {(one.name, one.channel): one.decision for one in found.attempts if one.round == 1}
+    for one in first:
+        key = (one.effect, one.place if one.effect == "extra input" else "")
+        assert by_name.get(key, one.decision) == one.decision
+    kept = [one for one in found.to_dict()["attempts"] if one["decision"] == "accepted"]
+    assert [(one["channel"], one["output"]) for one in kept] == [("heat", "y")]
 
 
 def test_candidates_can_be_named(found: Any) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import pyro_dynogp as dgp
+from pyro_dynogp.discrepancy.result import KEPT
 from tests.benchmarks import planted
 from tests.benchmarks.kept_rows import read_rows
 from tests.benchmarks.planted import KEY, Case, cases_of, channel_of, collect
@@ -18,6 +19,7 @@ from tests.benchmarks.planted_table import (
     is_found,
     is_right,
     is_wider,
+    relied_on,
     tables,
     top_name,
 )
@@ -158,6 +160,18 @@ def test_tables_of_a_made_up_study():
     assert "| drift | weak | 2 | 0.00 | 0.00 | 0.00 | 4.000 | 1.100 | - | 0.940 |" in text
     assert "| outside catalogue | strong | structure left, cause unknown | nothing | 1 |" in text
     assert "- 1 x ValueError: no" in text
+
+
+def test_errors_after_are_those_of_the_fit_to_rely_on():
+    """Where effects do harm the report gives the model before."""
+    kept = row("drift", "drift", outcome=KEPT)
+    assert is_right(kept)
+    assert relied_on(kept) == kept["before"]
+    assert relied_on(row("drift", "drift")) == row("drift", "drift")["after"]
+    text = tables([kept])
+    assert "| drift | strong | 1 | 1.00 | 1.00 | 0.00 | 4.000 | 4.000 | 4.000 |" in text
+    assert "The model before was kept in 100.0 % (1 of 1;" in text
+    assert "The model before was kept" not in tables([row("drift", "drift")])
 
 
 def test_picture(tmp_path):

@@ -9,8 +9,10 @@ import pytest
 
 import pyro_dynogp as dgp
 from pyro_dynogp import effects
-from pyro_dynogp.data.channels import Delayed, Recorded, Trend
+from pyro_dynogp.data.channels import Delayed, Recorded, Step, Trend
+from pyro_dynogp.discrepancy.held_out import forecast_errors, held_out_density
 from pyro_dynogp.discrepancy.search import candidates_of
+from pyro_dynogp.discrepancy.trials import Trial, run, why_not
 from pyro_dynogp.inference import refit as refits
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.methods.base import Problem
@@ -129,6 +131,41 @@ def test_a_function_more_is_climbed_from_linear_fits_of_its_own_too():
     first = dgp.fit(model, record, method="map", restarts=4, workers=1, progress=False)
     # Of what the base has learnt alone: some 150 nats less.
     assert energy(refit(base, record, model=model, run=RUN)) < energy(first) + 100.0
+
+
+@pytest.mark.parametrize(
+    ("channels", "said"),
+    [
+        ((Recorded("still"),), "'still' is constant on the training block"),
+        ((Step(25.0),), "'step at 25' is constant on the training block"),
+        ((Trend(0.0, 30.0), Trend(0.0, 30.0)), "the model has 'trend' already"),
+    ],
+)
+def test_why_a_trial_failed_is_said_in_words_of_the_data(record, base, channels, said):
+    model = MODEL
+    for channel in channels:
+        model = with_channel(model, channel)
+    fold = np.arange(N) >= 200
+    found = run(Trial((model,), record, (fold,), base, 0, SETTINGS, "forecast"))
+    assert found.failure == said
+    assert "Record.select" not in found.failure
+
+
+def test_what_else_a_refit_refuses_is_said_without_advice(record, base):
+    trial = Trial((MODEL,), record, (np.arange(N) >= 200,), base, 0, SETTINGS)
+    error = ValueError("record: expected 7 samples, got 3. Give a longer one (Record.select).")
+    assert why_not(trial, error) == "record: expected 7 samples, got 3"
+
+
+def test_errors_of_forecasts_are_kept_whatever_is_scored(record, base):
+    fold = np.arange(N) >= 200
+    for score in ("one step", "forecast"):
+        found = run(Trial((MODEL,), record, (fold,), base, 0, SETTINGS, score))
+        assert found.errors.shape == (100, 1)
+        wanted = forecast_errors(found.fit, record, fold)[0][fold]
+        np.testing.assert_array_equal(found.errors, wanted)
+        density = held_out_density(found.fit, record, fold, score)
+        np.testing.assert_array_equal(found.densities, density)
 
 
 def test_what_cannot_be_fitted_is_said(record, base):

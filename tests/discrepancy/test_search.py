@@ -12,10 +12,10 @@ from scipy import stats
 import pyro_dynogp as dgp
 from pyro_dynogp import effects
 from pyro_dynogp.discrepancy.context import SearchContext
-from pyro_dynogp.discrepancy.decision import certain
+from pyro_dynogp.discrepancy.held_out import without
+from pyro_dynogp.discrepancy.judged import certain
 from pyro_dynogp.discrepancy.search import Found, candidates_of, look, rated
 from pyro_dynogp.discrepancy.state import SearchState
-from pyro_dynogp.discrepancy.trials import without
 from pyro_dynogp.effects import Effect
 from pyro_dynogp.statistics import omnibus
 from pyro_dynogp.statistics.evidence import Evidence
@@ -59,11 +59,12 @@ def test_false_discovery_rates_hold_however_tests_depend():
 
 def test_every_output_is_paid_for():
     """Of two outputs there are twice as many tests: the same p-value is worth half as much."""
-    residuals = SimpleNamespace()
+    residuals = SimpleNamespace(output_name="y")
     one, _ = look([residuals], [Certain("a", 0.02)], SETTINGS, seed=0, workers=1)
     two, _ = look([residuals, residuals], [Certain("a", 0.02)], SETTINGS, seed=0, workers=1)
     assert [f.evidence.p_value for f in one] == [0.02]
     assert [f.evidence.p_value for f in two] == [0.04, 0.04]
+    assert [f.evidence.output for f in two] == ["y", "y"]
     certainly, _ = look([residuals] * 3, [Certain("a", 0.5)], SETTINGS, seed=0, workers=1)
     assert max(f.evidence.p_value for f in certainly) == 1.0
 
@@ -118,7 +119,7 @@ def test_a_function_of_the_output_has_its_limits_too(state, monkeypatch):
         return SimpleNamespace(found=[], residuals=[], whole=[], notes=[])
 
     monkeypatch.setattr(SearchContext, "look", look_)
-    monkeypatch.setattr(SearchContext, "left", lambda self, looked: ())
+    monkeypatch.setattr(SearchContext, "left", lambda self, looked: ((), ()))
     general = Found(*speaking(effects.OutputNonlinearity(), 1e-9), 1e-8)
     state.accepted = [(general, SimpleNamespace(ties=()))]
     state.look()
@@ -151,9 +152,9 @@ def test_two_answers_to_whether_anything_is_left_share_the_level(state):
     assert half.gate == pytest.approx(0.01)
     found = Found(*speaking(effects.LevelShift(), 0.02), 0.03)
     looked = SimpleNamespace(found=[found], residuals=[], whole=[])
-    assert context.left(looked) == ()  # 0.03 is more than half of 0.05
+    assert context.left(looked)[0] == ()  # 0.03 is more than half of 0.05
     sure = SimpleNamespace(found=[replace(found, q_value=0.02)], residuals=[], whole=[])
-    assert "level shift (0.02)" in context.left(sure)[0]
+    assert "level shift (0.02)" in context.left(sure)[0][0]
 
 
 def test_the_omnibus_test_pays_for_its_five_ways(monkeypatch):

@@ -12,9 +12,9 @@ import pyro_dynogp as dgp
 from pyro_dynogp import effects
 from pyro_dynogp.discrepancy.blocks import blocks_of
 from pyro_dynogp.discrepancy.context import SearchContext, Tested
+from pyro_dynogp.discrepancy.held_out import without
 from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.discrepancy.state import SearchState
-from pyro_dynogp.discrepancy.trials import without
 from pyro_dynogp.inference.refit import refit
 from pyro_dynogp.models.variants import has_process_noise, without_process_noise
 from pyro_dynogp.statistics.evidence import Evidence
@@ -76,12 +76,17 @@ def test_what_is_left_is_said(rounds):
         Found(effects.LevelShift(), Evidence("level shift", 1.0, q / 4, 3.0, 0.1), q)
         for q in (0.03, 0.02)
     ]
-    assert rounds.left(Tested([quiet], [quiet], [], [])) == ()
-    assert rounds.left(Tested([quiet], [quiet], found[:1], [])) == ()  # half of the level is 0.025
-    assert "level shift (0.02)" in rounds.left(Tested([quiet], [quiet], found, []))[0]
+    said, (p,) = rounds.left(Tested([quiet], [quiet], [], []))
+    assert said == ()
+    assert p > rounds.gate
+    said, _ = rounds.left(Tested([quiet], [quiet], found[:1], []))
+    assert said == ()  # half of the level is 0.025
+    assert "level shift (0.02)" in rounds.left(Tested([quiet], [quiet], found, []))[0][0]
     better = Found(effects.LevelShift(), Evidence("level shift", 1.0, 1e-3, 3.0, 0.1), 4e-3)
-    assert "level shift (0.004)" in rounds.left(Tested([quiet], [quiet], [better, *found], []))[0]
-    (said,) = rounds.left(Tested([quiet], [product], [], []))
+    (said,), _ = rounds.left(Tested([quiet], [quiet], [better, *found], []))
+    assert "level shift (0.004)" in said
+    (said,), (p,) = rounds.left(Tested([quiet], [product], [], []))
+    assert p <= rounds.gate
     assert "products of inputs" in said
 
 
@@ -178,7 +183,7 @@ def test_where_nothing_can_be_added_without_process_noise_the_search_begins_agai
     assert report.after["rmse"] < 0.7 * report.before["rmse"]
     assert sum(said in one for one in report.warnings) == 1
     again = effect is OnlyBesideNoise
-    assert has_process_noise(report.fit.model) == again
+    assert has_process_noise(report.extended.model) == again
     assert {one.round for one in report.attempts if one.decision == "accepted"} == {1 + again}
 
 

@@ -10,7 +10,7 @@ import torch
 import pyro_dynogp as dgp
 from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.data.channels import Recorded
-from pyro_dynogp.discrepancy.trials import held_out_density
+from pyro_dynogp.discrepancy.held_out import held_out_density
 from pyro_dynogp.inference import refit as refits
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.optimise.maximum import maximise

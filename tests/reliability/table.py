@@ -301,7 +301,7 @@ TABLE: dict[str, Entry] = {
         {"fit": (None, 3, "text"), "record": lambda w: [*RECORD, *w.others, w.blank],
          "candidates": (3, "a"), "seed": SEED, "max_rounds": (*COUNT, None),
          "level": SHARE, "tries": (*COUNT, None), "effects": (3, ["a"], "a"), "settings": (3, {}),
-         "workers": COUNT, "progress": SWITCH}, late=True),
+         "workers": COUNT, "progress": SWITCH, "time_limit": POSITIVE}, late=True),
     "Modes": plain(dgp.Modes, {
         "poles": ([], ["a"], [1.0], [np.nan], None, "text", 3.0),
         "input_gain": ([[1.0, 2.0], [1.0, 2.0]], "text", [np.nan], [["a"]]),

@@ -1,28 +1,111 @@
-"""What a report says of the last block."""
+"""What a report says of the last block, and which fit it gives."""
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 
-from pyro_dynogp import LoopSettings
-from pyro_dynogp.report.last_block import does_not_pay
+import pyro_dynogp as dgp
+from pyro_dynogp import LoopSettings, effects
+from pyro_dynogp.discrepancy.result import KEPT
+from pyro_dynogp.report import last_block
+from pyro_dynogp.report.last_block import _outcome, harm_done
+from tests.discrepancy.test_loop import close, fitted, machine
 
 BEFORE = {"rmse": 1.0, "crps": 0.5}
 
 
 @pytest.mark.parametrize(
-    ("after", "gain", "warned"),
+    ("after", "gain", "harm"),
     [
         ({"rmse": 0.5, "crps": 0.25}, 20.0, False),
-        ({"rmse": 0.5, "crps": 0.25}, -5.0, False),  # within two standard errors
-        ({"rmse": 0.5, "crps": 0.25}, -7.0, True),  # forecasts are better, the density is not
+        ({"rmse": 0.5, "crps": 0.25}, -5.0, False),
+        ({"rmse": 0.5, "crps": 0.25}, -5.9, False),  # within two standard errors
+        ({"rmse": 0.5, "crps": 0.25}, -6.1, True),  # forecasts are better, the density is not
         ({"rmse": 1.02, "crps": 0.51}, 20.0, False),  # noise of another kind
+        ({"rmse": 1.04, "crps": 0.52}, 20.0, False),
+        ({"rmse": 1.06, "crps": 0.53}, 20.0, True),
         ({"rmse": 1.3, "crps": 0.4}, 20.0, False),  # one of the scores is better
+        ({"rmse": 0.9, "crps": 0.7}, 20.0, False),
         ({"rmse": 1.3, "crps": 0.7}, 20.0, True),
     ],
 )
-def test_what_does_not_pay_is_said(after: dict[str, float], gain: float, warned: bool) -> None:
-    found = does_not_pay(BEFORE, after, gain, 3.0, LoopSettings())
-    assert bool(found) is warned
-    if warned:
+def test_harm_is_said(after: dict[str, float], gain: float, harm: bool) -> None:
+    found = harm_done(BEFORE, after, gain, 3.0, LoopSettings())
+    assert bool(found) is harm
+    if harm:
         assert f"CRPS 0.5 -> {after['crps']:.3g}, elpd {gain:+.1f} +- 3.0 nats" in found[0]
+        assert "Rely on the model before" in found[0]
+
+
+def test_two_models_that_are_the_same_do_no_harm() -> None:
+    assert harm_done(BEFORE, BEFORE, 0.0, 0.0, LoopSettings()) == []
+
+
+@pytest.mark.parametrize(
+    ("accepted", "left", "early", "harm", "outcome"),
+    [
+        (True, False, False, False, "effects added"),
+        (True, True, False, False, "effects added, structure left"),
+        (True, True, False, True, KEPT),
+        (True, False, True, True, KEPT),
+        (True, False, True, False, "effects added, search ended early"),
+        (False, False, True, False, "search ended early"),
+        (False, True, True, False, "search ended early"),
+        (False, True, False, False, "structure left, cause unknown"),
+        (False, False, False, False, "nothing missing"),
+    ],
+)
+def test_outcomes(accepted: bool, left: bool, early: bool, harm: bool, outcome: str) -> None:
+    course: Any = SimpleNamespace(accepted=accepted, left=left, early=early)
+    assert _outcome(course, harm) == outcome
+
+
+def turned() -> dgp.Record:
+    """A line in time that turns back where the last block begins."""
+    record = machine(seed=3)
+    path = [min(k, 720 - k) / 240 for k in range(len(record))]
+    return record.with_outputs(record.outputs[:, 0] + path)
+
+
+@pytest.fixture(scope="module")
+def kept() -> Any:
+    record = turned()
+    return close(fitted(record), record, effects=(effects.Drift(),))
+
+
+def test_where_effects_do_harm_the_model_before_is_the_fit(kept: Any, tmp_path: Any) -> None:
+    assert [one.name for one in kept.effects] == ["drift"]
+    assert kept.after["rmse"] > 1.05 * kept.before["rmse"]
+    assert kept.outcome == "effects named, model kept"
+    assert kept.model_kept
+    assert kept.fit is kept.base
+    assert kept.extended is not kept.base
+    assert kept.extended.model.channels
+    assert not kept.fit.model.channels
+    assert kept.effects[0].parameters  # those of the extended fit
+    first, *others = str(kept).splitlines()
+    assert first.startswith("Effects named, model kept: ")
+    assert "Rely on the model before (report.fit)" in first
+    assert any("What was added does harm on the last block" in line for line in others)
+    assert kept.to_dict()["model_kept"] is True
+    kept.to_html(tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    headline = page.partition("<h1>")[2].partition("</h1>")[0]
+    assert headline.startswith("One effect was named, but the model is kept as it was")
+    assert "Rely on the model before" in page
+
+
+def test_without_harm_the_extended_model_is_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    record = machine(weight=0.3)
+    report = close(fitted(record), record)
+    assert report.outcome == "effects added"
+    assert report.fit is report.extended is not report.base
+    assert str(report).startswith("Effects added.\n")
+    monkeypatch.setattr(last_block, "harm_done", lambda *given: ["Harm."])
+    again = close(fitted(record), record)
+    assert again.fit is again.base
+    assert again.after == report.after  # the numbers stay as measured
+    assert again.outcome == KEPT

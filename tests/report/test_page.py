@@ -11,6 +11,7 @@ import pytest
 
 import pyro_dynogp as dgp
 from pyro_dynogp.data.channels import Delayed, Recorded, Step, Trend
+from pyro_dynogp.discrepancy.result import KEPT
 from pyro_dynogp.models.description import Part, describe
 from pyro_dynogp.models.variants import with_channel, with_likelihood, with_output_function
 from pyro_dynogp.report.html.diagram import diagram, marks
@@ -101,12 +102,40 @@ def test_everything_is_said(made, found):
         assert one.block in words
     for one in made.attempts:
         assert one.reason in words
-    for sentence in (*made.warnings, made.data, *made.seconds, *made.tests):
+    for sentence in (*made.warnings, made.data, *made.seconds, *made.last_block_tests):
         assert sentence in words
     assert "84.3 ± 12.7 nats" in words
     assert "gain of ambient [m/°C] 0.0121 ± 0.0009" in words
     assert "Size (root mean square) 0.310 m" in words
     assert "below 0.0001" in words
+
+
+def test_every_test_of_the_search_is_on_the_page(made, found):
+    words = found.text.partition("Every test of the search")[2]
+    assert "3 tests of the residuals in all." in words
+    assert "Extra input level ambient 1 below 0.0001 0.00040 accepted" in words
+    assert "Level shift level time 31.5 1 0.31 1.0 not significant" in words
+    assert "Any structure level – 2 0.74 0.74 not significant" in words
+
+
+def test_attempts_name_their_channel(found):
+    assert "Drift, ambient What the test for drift says." in found.text
+
+
+def test_a_model_that_is_kept_is_the_headline():
+    _, found = checked(reports.report(outcome=KEPT))
+    assert (
+        "Two effects were named, but the model is kept as it was, as it does worse with them on "
+        "the sealed data: extra input and dead time." in found.text
+    )
+    assert "Rely on the model before, not on the extended one." in found.text
+    assert "added: extra input" not in found.text
+
+
+def test_a_search_that_ended_early_says_so():
+    made = reports.report(outcome="effects added, search ended early")
+    assert _headline(made).endswith("extra input and dead time; the search ended early.")
+    assert _headline(reports.nothing(outcome="search ended early")) == "Search ended early."
 
 
 def test_figures(made, found):
@@ -162,7 +191,7 @@ def test_names_of_users_files():
             known=known, sealed=sealed, forecast_before=forecast, forecast_after=forecast,
             effects=(evil,), warnings=(EVIL,), data=EVIL, model_before=(Part(EVIL, EVIL),),
             model_after=(Part(EVIL, EVIL), Part("long", EVIL * 3)),
-            tests={EVIL: (0.1, 0.2)}, seconds={EVIL: 1.0},
+            last_block_tests={EVIL: (0.1, 0.2)}, seconds={EVIL: 1.0},
             attempts=(reports.attempt(1, EVIL, 0.01, "rejected", EVIL),
                       reports.attempt(1, EVIL, 0.1, "not tried", EVIL)),
         )
@@ -194,8 +223,8 @@ def test_what_was_not_computed():
     _, found = checked(
         reports.report(
             effects=(bare,), outcome="effects added, structure left", before={"rmse": NAN},
-            after={}, elpd_gain=NAN, elpd_gain_error=NAN, attempts=(), tests={}, seconds={},
-            warnings=(),
+            after={}, elpd_gain=NAN, elpd_gain_error=NAN, attempts=(), last_block_tests={},
+            tests=(), seconds={}, warnings=(),
         )
     )  # fmt: skip
     assert "extra input; structure of unknown cause is left." in found.text

@@ -27,7 +27,12 @@ if TYPE_CHECKING:
     from pyro_dynogp.statistics.evidence import Curve
 
 _NOTHING_ADDED = "Nothing was added: the model is the one that was given."
-_ORDER = {"accepted": 0, "tie": 1, "reported": 2, "rejected": 3, "not tried": 4}
+_ORDER = {
+    name: place
+    for place, name in enumerate(
+        ("accepted", "tie", "reported", "undecided", "nearly", "rejected", "not tried")
+    )
+}
 
 
 def effects(report: LoopResult) -> str:
@@ -136,7 +141,7 @@ def _sorted(attempts: Sequence[Attempt]) -> list[Attempt]:
 def _tried(one: Attempt) -> list[str | Cell]:
     p, q = probability(one.evidence.p_value), probability(one.q_value)
     return [
-        Cell((_capital(one.name), one.evidence.sentence)),
+        Cell((_titled(one), one.evidence.sentence)),
         str(one.round),
         Cell((f"p {p}", f"q {q}"), plain=True),
         plus_minus(one.gain, one.gain_error),
@@ -147,9 +152,29 @@ def _tried(one: Attempt) -> list[str | Cell]:
 
 def _named(one: Attempt) -> Cell:
     """Name of an effect, and what its test says where it says anything."""
-    channel = one.evidence.where.get("channel", "")
-    name = f"{_capital(one.name)}, {channel}" if channel else _capital(one.name)
-    return Cell((name, one.evidence.sentence if one.q_value <= LEVEL else ""))
+    return Cell((_titled(one), one.evidence.sentence if one.q_value <= LEVEL else ""))
+
+
+def _titled(one: Attempt) -> str:
+    """Name of an effect with its channel."""
+    return _capital(f"{one.name}, {one.channel}" if one.channel else one.name)
+
+
+def all_tests(report: LoopResult) -> str:
+    """Table of every test of every round, whatever came of it."""
+    if not report.tests:
+        return paragraph("No residual was tested.")
+    head = ["Test for", "Output", "Channel or place", "Round", "p", "q", "What became of it"]
+    rows = [
+        [_capital(one.effect), one.output, one.place or "–", str(one.round),
+         probability(one.p_value), probability(one.q_value), one.decision]
+        for one in report.tests
+    ]  # fmt: skip
+    words = (
+        f"{len(rows)} test{'s' if len(rows) > 1 else ''} of the residuals in all. Where nothing is "
+        f"missing about one in twenty has a p-value below {LEVEL}; q-values allow for that."
+    )
+    return paragraph(words) + table("Tests of the residuals", head, rows, "tttnnnt")
 
 
 def _capital(words: str) -> str:

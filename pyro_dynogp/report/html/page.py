@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pyro_dynogp.report.html.diagram import diagram, marks
-from pyro_dynogp.report.html.effects import attempts, effects
+from pyro_dynogp.report.html.effects import all_tests, attempts, effects
 from pyro_dynogp.report.html.html import (
     duration,
     items,
@@ -17,7 +17,7 @@ from pyro_dynogp.report.html.html import (
     table,
     text,
 )
-from pyro_dynogp.report.html.scores import SAME, output_unit, scores, tests
+from pyro_dynogp.report.html.scores import SAME, last_block_tests, output_unit, scores
 from pyro_dynogp.report.html.style import STYLE
 
 if TYPE_CHECKING:
@@ -62,8 +62,9 @@ def page(report: LoopResult) -> str:
         *([("What is left", items(report.left))] if report.left else []),
         ("The model", _models(report)),
         ("How well it predicts", scores(report)),
-        ("Tests", tests(report)),
+        ("Tests on the sealed data", last_block_tests(report)),
         ("What was tried", attempts(report)),
+        ("Every test of the search", all_tests(report)),
         ("Which data were for what", _data(report)),
         ("Where the time went", _times(report)),
         ("Terms", _terms()),
@@ -89,7 +90,15 @@ def _headline(report: LoopResult) -> str:
         how_many = _NUMBERS[count] if count < len(_NUMBERS) else str(count)
         verb = "effect was" if count == 1 else "effects were"
         names = listed([one.name for one in report.effects])
+        if report.model_kept:
+            added = "it" if count == 1 else "them"
+            return (
+                f"{how_many} {verb} named, but the model is kept as it was, as it does worse with "
+                f"{added} on the sealed data: {names}."
+            )
         words = f"{how_many} {verb} missing from the model and added: {names}"
+        if "ended early" in report.outcome:
+            return f"{words}; the search ended early."
         return f"{words}; structure of unknown cause is left." if left else f"{words}."
     if report.outcome == "nothing missing":
         return "No effect was found that the model lacks."
@@ -111,6 +120,8 @@ def _key(report: LoopResult) -> str:
     if before > 0 and abs(after / before - 1.0) >= SAME:
         way = "smaller" if after < before else "larger"
         words += f": {100 * abs(after / before - 1.0):.3g} % {way}"
+    if report.model_kept:
+        words += ". Rely on the model before, not on the extended one"
     return paragraph(f"{words}.", "lead")
 
 

@@ -154,12 +154,15 @@ def _rmse_in_words(report: LoopResult) -> str:
     return f"Root mean square error {measure(before, unit)} before, {measure(after, unit)} after."
 
 
-def tests(report: LoopResult) -> str:
+def last_block_tests(report: LoopResult) -> str:
     """Table of the tests on the sealed block, those that changed first."""
-    if not report.tests:
+    if not report.last_block_tests:
         return paragraph("No test was repeated on the sealed data.")
-    ranked = sorted(report.tests.items(), key=lambda one: _rank(*one[1]))
-    failed = [sum(p < LEVEL for p in column) for column in zip(*report.tests.values(), strict=True)]
+    ranked = sorted(report.last_block_tests.items(), key=lambda one: _rank(*one[1]))
+    failed = [
+        sum(p < LEVEL for p in column)
+        for column in zip(*report.last_block_tests.values(), strict=True)
+    ]
     caption = "Tests repeated on the sealed data"
     rows: list[list[str | Cell]] = []
     if report.effects:

@@ -1,0 +1,97 @@
+"""How well fits predict data that they have not seen, and which data those are."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import logsumexp
+
+from pyro_dynogp.criticism.densities import pointwise_log_density
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.effects.base import Score
+from pyro_dynogp.fitting import Fit
+from pyro_dynogp.models.outputs import output_process
+from pyro_dynogp.prediction.first_state import beginning
+
+
+def without(record: Record, fold: np.ndarray) -> Record:
+    """The record with the outputs of a fold missing; cut where nothing is left to the end."""
+    y = record.outputs.copy()
+    y[fold] = np.nan
+    there = np.flatnonzero(np.isfinite(y).any(1))
+    return record.with_outputs(y)[: there[-1] + 1]
+
+
+def held_out_density(fit: Fit, record: Record, fold: np.ndarray, score: Score) -> np.ndarray:
+    """Log-densities (N,) of the measured outputs of a fold [nats].
+
+    "one step": each given all outputs before it, of the mixture of the fit's draws; outputs of one
+    time follow one another. What is wrong with the noise shows there. "forecast": each by itself,
+    given the inputs and the outputs before its stretch of the fold, as a normal whose standard
+    deviation is that of the forecast times the factor that suits the fold best. What is wrong
+    between inputs and output shows there, while outputs of one step before make up for much of it;
+    and what is asked is which structure is right, not which posterior mode is least sure of itself.
+    """
+    return scored(fit, record, fold, score)[0]
+
+
+def scored(
+    fit: Fit, record: Record, fold: np.ndarray, score: Score
+) -> tuple[np.ndarray, np.ndarray]:
+    """What `held_out_density` says, and errors (M, n_y) of forecasts of the fold's stretches."""
+    prepared = fit.model.check(record)[0]
+    there = ~prepared.missing
+    error, sd = (x[fold] for x in forecast_errors(fit, prepared, fold))
+    if score == "one step":
+        density = one_step_density(fit, prepared)[fold]
+    else:
+        density = forecast_density(error, sd)
+    return density[there[fold]], error
+
+
+def forecast_density(error: np.ndarray, sd: np.ndarray) -> np.ndarray:
+    """Log-densities (n, n_y) of errors under the sds times the factor that suits them best [nats].
+
+    NaN where the errors are.
+    """
+    z = error / sd
+    spread = np.sqrt(np.nanmean(z**2, axis=0))
+    density: np.ndarray = -0.5 * ((z / spread) ** 2 + np.log(2.0 * np.pi)) - np.log(spread * sd)
+    return density
+
+
+def forecast_errors(fit: Fit, record: Record, fold: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Errors (n, n_y) of forecasts of every stretch of a fold from its past, and their sds.
+
+    In units of the output, NaN outside the fold; errors are NaN where the output is missing, too.
+    """
+    prepared = fit.model.check(record)[0]
+    error = np.full(prepared.outputs.shape, np.nan)
+    sd = error.copy()
+    for part in stretches(fold):
+        found = fit.forecast(prepared[: part.start], prepared[part], seed=fit.seed)
+        error[part] = prepared.outputs[part] - found.mean
+        sd[part] = found.sd
+    return error, sd
+
+
+def one_step_density(fit: Fit, record: Record) -> np.ndarray:
+    """Log-density (n, n_y) of each output given the outputs before it, NaN where missing."""
+    (along,) = fit.model.prepare(record)
+    outputs = output_process(beginning(fit, along, predicting=True), along)
+    each = pointwise_log_density(outputs, along.observations, "forecast")
+    return logsumexp(each, axis=0) - np.log(len(each))
+
+
+def stretches(mask: np.ndarray) -> list[slice]:
+    """Stretches of samples for which a mask (n,) holds."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
+    return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def interleaved(count: int, blocks: int) -> tuple[np.ndarray, ...]:
+    """Two folds (n,): every other block of a record, and those between but for the first.
+
+    What happens at one instant has data on either side of it in both.
+    """
+    number = np.arange(count) * blocks // max(count, 1)
+    return (number % 2 == 1), ((number % 2 == 0) & (number > 0))

@@ -1,0 +1,120 @@
+"""Refits of a round: which are made, on which blocks, and how long they may go on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import joblib
+import numpy as np
+
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.discrepancy.held_out import interleaved
+from pyro_dynogp.discrepancy.judged import Judged, Kind, judge, kind_of
+from pyro_dynogp.discrepancy.search import Candidate, Found
+from pyro_dynogp.discrepancy.trials import Trial, Tried, run
+from pyro_dynogp.fitting import Fit
+from pyro_dynogp.models.variants import Model
+from pyro_dynogp.statistics.settings import LoopSettings
+from pyro_dynogp.support.parallel import parallel_map
+
+
+@dataclass(eq=False)
+class Refits:
+    """Refits of a round, and what they say: each block is fitted once.
+
+    Attributes:
+        current: fit of the model that is extended, to what is not held out.
+        record: blocks A and B. held_out: (n,) True in B.
+        number: of the round. seed, settings, workers, progress, late: as of `confirm`.
+        results: of the trials so far, by the models and how they are scored.
+        early: whether the time limit was passed with trials to go.
+    """
+
+    current: Fit
+    record: Record
+    held_out: np.ndarray
+    number: int
+    seed: int
+    settings: LoopSettings
+    workers: int | None
+    progress: bool
+    late: Callable[[], bool] | None = None
+    results: dict[tuple[str, Kind], Tried] = field(default_factory=dict)
+    early: bool = False
+
+    @cached_property
+    def model(self) -> Model:
+        """The model that is extended."""
+        return replace(self.current.model, scaling=None)
+
+    def trial(self, models: tuple[Model, ...], kind: Kind, found: Found | None) -> Trial:
+        """Of variants of an effect, or of the model itself."""
+        where, score = kind
+        known = self.current if found is None and where == "after" else None
+        spread = interleaved(len(self.record), self.settings.folds)
+        folds = spread if where == "spread" else (self.held_out,)
+        plain = Trial(
+            models, self.record, folds, self.current, self.seed, self.settings, score, fit=known
+        )
+        if found is None:
+            return plain
+        return replace(plain, refine=found.effect.refine, compared=found.effect.compared)
+
+    def run(self, tasks: dict[Any, Trial], label: str) -> dict[Any, Tried]:
+        """Results of trials by key; with a time limit of those that are begun before it passes.
+
+        Then as many at a time as there are workers, with a look at the clock between.
+        """
+        trials = list(tasks.values())
+        step = len(trials) if self.late is None else self.workers or joblib.cpu_count()
+        done: list[Tried] = []
+        for begin in range(0, len(trials), max(step, 1)):
+            if self.late is not None and self.late():
+                self.early = True
+                break
+            done += parallel_map(
+                run, trials[begin : begin + step], workers=self.workers, progress=self.progress,
+                description=f"{label}, round {self.number}",
+            )  # fmt: skip
+        return dict(zip(tasks, done, strict=False))
+
+    def judge(self, candidates: Sequence[Candidate]) -> list[Judged]:
+        """Candidates, each against the model without it; those that were refitted in time."""
+        # Two effects may be the same block of the model: it is fitted once.
+        kinds = [kind_of(found) for found, _ in candidates]
+        tasks = {("", kind): self.trial((self.model,), kind, None) for kind in kinds}
+        for (found, variants), kind in zip(candidates, kinds, strict=True):
+            tasks[repr(variants), kind] = self.trial(variants, kind, found)
+        self.results.update(self.run(tasks, "refits"))
+        return [
+            self.judged(found, kind, self.results[repr(variants), kind])
+            for (found, variants), kind in zip(candidates, kinds, strict=True)
+            if (repr(variants), kind) in self.results
+        ]
+
+    def judged(self, found: Found, kind: Kind, tried: Tried) -> Judged:
+        """One candidate against the model without it."""
+        base = self.results["", kind]
+        return judge(found, kind, tried, base, self.number, self.settings)
+
+    def on_one_scale(self, better: Sequence[Judged]) -> list[Judged]:
+        """The same candidates scored alike, since gains on different densities do not compare."""
+        if len({one.kind for one in better}) == 1:
+            return list(better)
+        common: Kind = ("spread", "forecast")
+        others = [one for one in better if one.kind != common]
+        more = {
+            repr(one.tried.model): self.trial((one.tried.model,), common, one.found)
+            for one in others
+        }
+        again = self.run(more, "refits once more")
+        if self.early:
+            return list(better)
+        return [
+            one if one.kind == common
+            else self.judged(one.found, common, again[repr(one.tried.model)])
+            for one in better
+        ]  # fmt: skip
