@@ -14,7 +14,7 @@ LINES = 31_500
 # Gauss-Newton (1900 lines), nonlinear feedback (650 lines), known functions and branches (430
 # lines), integrators (450 lines), checks of arguments, two effects (330 lines) and a closed loop
 # that does no harm (480 lines) came since. To shrink, and to go.
-LINES_TODAY = 41_600
+LINES_TODAY = 41_650
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

@@ -54,7 +54,9 @@ def report_of(base: Fit, extended: Fit, course: SearchState, warnings: Sequence[
     elpd_gain, elpd_gain_error = float(gain.sum()), block_standard_error(gain)[0]
     harm: list[str] = []
     if accepted:
-        harm = harm_done(before, after, elpd_gain, elpd_gain_error, rounds.settings)
+        compared = before, after, elpd_gain, elpd_gain_error, rounds.settings
+        harm = harm_done(*compared)
+        warnings = [*disagreement(*compared), *warnings]
     watch.stop("scores of the last block")
     tests = _tested([f for f, _ in accepted], (base, extended), whole, sealed, rounds)
     watch.stop("residual tests of the last block")
@@ -96,14 +98,16 @@ def harm_done(
     """In words, that the extended model does worse on the last block; nothing where it does not.
 
     It does where the RMSE and the CRPS of its forecasts are more than `settings.worse` times those
-    before, or where it loses more log density than `settings.worse_errors` standard errors.
+    before, or where it loses more log density than `settings.worse_errors` standard errors and does
+    not forecast better by both scores: densities one step ahead fall, too, where process noise has
+    gone that made up for what was missing.
 
     Args:
         before, after: scores of the forecasts [output].
         gain, error: in log density, with its block standard error [nats].
     """
     worse = all(after[name] > settings.worse * before[name] for name in ("rmse", "crps"))
-    if not worse and gain >= -settings.worse_errors * error:
+    if not worse and not _less_likely(before, after, gain, error, settings):
         return []
     scores = ", ".join(
         f"{name.upper()} {before[name]:.3g} -> {after[name]:.3g}" for name in ("rmse", "crps")
@@ -113,6 +117,39 @@ def harm_done(
         f"nats): what held-out data speak for need not last. Rely on the model before, which "
         f"report.fit is; report.extended is the extended one. Look at its residuals there, and "
         f"confirm what was named on another record before you use it."
+    ]
+
+
+def _better(before: Mapping[str, float], after: Mapping[str, float]) -> bool:
+    """Whether forecasts are better by both scores."""
+    return all(after[name] < before[name] for name in ("rmse", "crps"))
+
+
+def _less_likely(
+    before: Mapping[str, float],
+    after: Mapping[str, float],
+    gain: float,
+    error: float,
+    settings: LoopSettings,
+) -> bool:
+    """Whether log density is lost for certain, and no better forecasts make up for it."""
+    return gain < -settings.worse_errors * error and not _better(before, after)
+
+
+def disagreement(
+    before: Mapping[str, float],
+    after: Mapping[str, float],
+    gain: float,
+    error: float,
+    settings: LoopSettings,
+) -> list[str]:
+    """In words, that scores disagree: better forecasts, lower densities one step ahead."""
+    if gain >= -settings.worse_errors * error or not _better(before, after):
+        return []
+    return [
+        f"Scores of the last block disagree: forecasts are better with what was added, one step "
+        f"ahead the model before is more likely (elpd {gain:+.1f} +- {error:.1f} nats). Take the "
+        f"extended model (report.fit) for simulation and forecasts; one step ahead report.base."
     ]
 
 

@@ -11,7 +11,7 @@ import pyro_dynogp as dgp
 from pyro_dynogp import LoopSettings, effects
 from pyro_dynogp.discrepancy.result import KEPT
 from pyro_dynogp.report import last_block
-from pyro_dynogp.report.last_block import _outcome, harm_done
+from pyro_dynogp.report.last_block import _outcome, disagreement, harm_done
 from tests.discrepancy.test_loop import close, fitted, machine
 
 BEFORE = {"rmse": 1.0, "crps": 0.5}
@@ -23,7 +23,8 @@ BEFORE = {"rmse": 1.0, "crps": 0.5}
         ({"rmse": 0.5, "crps": 0.25}, 20.0, False),
         ({"rmse": 0.5, "crps": 0.25}, -5.0, False),
         ({"rmse": 0.5, "crps": 0.25}, -5.9, False),  # within two standard errors
-        ({"rmse": 0.5, "crps": 0.25}, -6.1, True),  # forecasts are better, the density is not
+        ({"rmse": 0.5, "crps": 0.25}, -6.1, False),  # forecasts are better, the density is not
+        ({"rmse": 0.5, "crps": 0.51}, -6.1, True),  # by one score alone
         ({"rmse": 1.02, "crps": 0.51}, 20.0, False),  # noise of another kind
         ({"rmse": 1.04, "crps": 0.52}, 20.0, False),
         ({"rmse": 1.06, "crps": 0.53}, 20.0, True),
@@ -38,6 +39,20 @@ def test_harm_is_said(after: dict[str, float], gain: float, harm: bool) -> None:
     if harm:
         assert f"CRPS 0.5 -> {after['crps']:.3g}, elpd {gain:+.1f} +- 3.0 nats" in found[0]
         assert "Rely on the model before" in found[0]
+
+
+@pytest.mark.parametrize(
+    ("after", "gain", "said"),
+    [
+        ({"rmse": 0.5, "crps": 0.25}, -6.1, True),
+        ({"rmse": 0.5, "crps": 0.25}, -5.9, False),
+        ({"rmse": 0.5, "crps": 0.51}, -6.1, False),
+    ],
+)
+def test_scores_that_disagree_are_said(after: dict[str, float], gain: float, said: bool) -> None:
+    found = disagreement(BEFORE, after, gain, 3.0, LoopSettings())
+    assert bool(found) is said
+    assert not said or "one step ahead report.base" in found[0]
 
 
 def test_two_models_that_are_the_same_do_no_harm() -> None:
