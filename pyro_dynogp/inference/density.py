@@ -91,6 +91,17 @@ def each_with_gradient(energy: Callable[[Tensor], Tensor], z: Tensor) -> tuple[T
     return value.detach().masked_fill(bad, torch.inf), gradient.masked_fill(bad[:, None], 0.0)
 
 
+def energies_of(energy: Callable[[Tensor], Tensor], z: Tensor) -> Tensor:
+    """Energies (k,) at z (k, d) without gradient, infinite where there are none."""
+    try:
+        with torch.no_grad(), pyro.validation_enabled(False):
+            return energy(z).nan_to_num(torch.inf, torch.inf, torch.inf)
+    except (NotPositiveDefiniteError, torch.linalg.LinAlgError, ValueError):
+        if len(z) == 1:
+            return torch.full((1,), torch.inf, dtype=torch.float64)
+        return torch.cat([energies_of(energy, half) for half in z.tensor_split(2)])
+
+
 @contextlib.contextmanager
 def denormals_flushed() -> Iterator[None]:
     """Inside, numbers below 1e-308 are zero; outside nothing has changed.

@@ -9,7 +9,6 @@ from pyro_dynogp.inference.importance_sampling import sample_around, samples_of
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.mode import at_optimum, best_optima, check_optimizer
 from pyro_dynogp.inference.optimise.maximum import Optimizer, Optimum
-from pyro_dynogp.inference.pareto import good_k
 from pyro_dynogp.inference.posteriors import Sampled
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.models.model import Model
@@ -76,7 +75,7 @@ def with_draws_around(
         seed=run.seed,
         progress=run.progress,
     )
-    good = good_k(len(found.draws))
+    good = found.good
     failed = not found.annealed and not found.k <= good
     if failed and not problem.model.has_function and samples_of(problem.records) > longest:
         mode = at_optimum(problem.model, optima, run.seed, problem.records)
