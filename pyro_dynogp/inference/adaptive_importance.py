@@ -11,15 +11,15 @@ around a few draws. No gradient is needed: a round costs as much as a few steps 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from scipy.special import logsumexp
 from torch import Tensor
 
-from pyro_dynogp.inference.methods.annealed import StudentMixture
 from pyro_dynogp.inference.pareto import effective, psis
+from pyro_dynogp.inference.student_mixture import StudentMixture
 
 # Share of a round that tempered weights keep effective, and so many draws for each dimension.
 EFFECTIVE, EACH = 0.1, 3.0
@@ -36,7 +36,7 @@ class Adapted:
     Attributes:
         z: (S, d) draws of all rounds. log_target: (S,). log_proposal: (S,) of the mixture of all
             proposals. log_weights: (S,) normalised, smoothed. k: Pareto shape of the ratios.
-        proposal: shaped by all of them. rounds: how many there were.
+        proposal: that the next round would have. rounds: how many there were.
     """
 
     z: Tensor
@@ -82,17 +82,17 @@ def adapt(
         proposals.append(proposal)
         log_proposal = logsumexp(log_each, 0) - np.log(len(proposals))
         ratio = log_target - log_proposal
-        log_weights, k = psis(ratio)
-        found = Adapted(
-            z, log_target, log_proposal, log_weights, float(k), proposal, len(proposals)
-        )
-        if enough(found) or not np.isfinite(log_target).any():
+        log_weights, k = np.full(len(z), -np.log(len(z))), np.inf
+        there = bool(np.isfinite(ratio).any())
+        if there:
+            log_weights, shape = psis(ratio)
+            k = float(shape)
+        found = Adapted(z, log_target, log_proposal, log_weights, k, proposal, len(proposals))
+        if enough(found) or not there:
             return found
         proposal = _shaped(proposal, z, _tempered(ratio, max(EFFECTIVE * count, EACH * z.shape[1])))
-        if len(proposals) == rounds:
-            return Adapted(
-                z, log_target, log_proposal, log_weights, float(k), proposal, len(proposals)
-            )
+        if found.rounds == rounds:
+            return replace(found, proposal=proposal)
 
 
 def _tempered(ratio: np.ndarray, least: float) -> np.ndarray:

@@ -4,8 +4,10 @@ The proposal is a mixture of multivariate Student-t distributions, one around ea
 carries weight, with the covariance that Laplace's approximation gives there, in coordinates without
 bent ridges (`inference.cascade_coordinates`). Every draw has the density of the whole mixture, so
 that ratios of the posterior over it give each optimum its posterior probability (Owen 2013, chapter
-9). Where Pareto's k says that the ratios are not to be trusted, the draws are annealed from the
-mixture to the posterior itself (`inference.methods.annealed`).
+9). Where Pareto's k says that the ratios are not to be trusted, rounds of draws of linear models
+shape the mixture (`inference.adaptive_importance`), and where that does not do, draws are annealed
+from it to the posterior itself (`inference.methods.annealed`). Of posteriors that repeat themselves
+with pairs in another order one copy is looked at (`inference.pair_order`).
 """
 
 from __future__ import annotations
@@ -26,12 +28,12 @@ from pyro_dynogp.inference.methods.annealed import (
     Annealed,
     Joint,
     Prior,
-    StudentMixture,
     anneal,
 )
 from pyro_dynogp.inference.pair_order import PairOrder
 from pyro_dynogp.inference.pareto import effective, good_k
 from pyro_dynogp.inference.posterior_draws import PosteriorDraws
+from pyro_dynogp.inference.student_mixture import StudentMixture
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.support.frozen import FrozenMapping
@@ -65,7 +67,8 @@ class Sampled:
     Attributes:
         draws: with the ratios of the proposal, or of the posterior itself where annealed.
         log_weights: (S,) normalised, smoothed. k: Pareto shape of the proposals' ratios.
-        good: up to which it is to be trusted. optima: how many components the proposal has. annealed: whether the draws were.
+        good: up to which it is to be trusted. optima: how many components the first proposal has.
+        annealed: whether draws were.
         mode: values of all sites at the optimum that carries most weight.
     """
 

@@ -1,10 +1,10 @@
 r"""Log joint density of linear models under Gaussian noise at many vectors, with gradients by hand.
 
-What `density.joint_energy` says of a model that is one layer of linear dynamics, whose noise has one
-size and whose first state is integrated out, without tensors or a graph: sites to poles and gains
-and back in numpy, likelihoods in compiled code (`lti.likelihood`), everything in scaled units. The
-tests hold it against the path through torch. A vector at which there is no density leaves the
-others alone.
+What `density.joint_energy` says of a model that is one layer of linear dynamics, whose noise has
+one size and whose first state is integrated out, without tensors or a graph: sites to poles and
+gains and back in numpy, likelihoods in compiled code (`lti.likelihood`), everything in scaled
+units. The tests hold it against the path through torch. A vector at which there is no density
+leaves the others alone.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ class LinearDensity:
     def _innovations(
         self, systems: Systems, data: _Data, *, keep: bool
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Tape]:
-        """z and d (k, N), where there is no density (k,), and the tape."""
+        """Z and d (k, N), where there is no density (k,), and the tape."""
         z, d, tape = innovations_of(systems, data.signals, data.missing, self._past, keep=keep)
         least = ROUNDING * np.abs(tape.stationary)
         above = (d.reshape(len(d), -1, least.shape[1]) > least[:, None]).all((1, 2))
@@ -174,6 +174,7 @@ class LinearEnergy(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, z: Tensor, density: LinearDensity, jacobian: bool) -> Any:
+        """Energies, with their gradients at once where they may be asked for."""
         u = z.detach().numpy()
         if not ctx.needs_input_grad[0]:
             return torch.from_numpy(density.energies(u, jacobian=jacobian))
@@ -183,6 +184,7 @@ class LinearEnergy(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *bars: Tensor) -> Any:
+        """Gradients by the vectors."""
         # Where there is no density the gradient is zero, whatever the bar is.
         bar = bars[0].nan_to_num(0.0, 0.0, 0.0)
         return bar[:, None] * ctx.gradient, None, None

@@ -1,8 +1,8 @@
 r"""Constrained values of unconstrained vectors and their prior density, entry by entry in numpy.
 
-What `torch.distributions.biject_to` and the distributions of `models.priors`, `models.horseshoe` and
-`layers.noise` say, for the kinds of sites that linear models have, with derivatives by hand. All
-entries of one kind are done together, whatever sites they are of.
+What `torch.distributions.biject_to` and the distributions of `models.priors`, `models.horseshoe`
+and `layers.noise` say, for the kinds of sites that linear models have, with derivatives by hand.
+All entries of one kind are done together, whatever sites they are of.
 """
 
 from __future__ import annotations
@@ -71,15 +71,14 @@ class VectorPriors:
     def _add(self, site: Site, entries: np.ndarray, kinds: dict[str, list[np.ndarray]]) -> None:
         prior: Any = site.prior
         base = getattr(prior, "base_dist", prior)
-        kind = type(prior if isinstance(prior, LogNormal | SharedScaleNormal) else base)
+        alone = isinstance(prior, LogNormal | SharedScaleNormal)
+        kind = type(prior if alone else base)
 
         def put(name: str, first: Any = 0.0, second: Any = 0.0) -> None:
             columns = [torch.as_tensor(x, dtype=torch.float64).expand(site.shape).reshape(-1)
                        for x in (first, second)]  # fmt: skip
             kinds.setdefault(name, []).append(np.stack([entries, *columns]))
 
-        if isinstance(prior, torch.distributions.Independent) and isinstance(base, LogNormal):
-            kind = LogNormal
         if kind is SharedScaleNormal:
             zero = torch.zeros(site.shape, dtype=torch.float64)
             self.constant += float(prior.log_prob(zero))

@@ -7,7 +7,7 @@ gives NaN or variances that are not positive, and leaves the others alone, to th
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -212,9 +212,7 @@ def _reverse(
             part[:] = 0.0
         _clear(bars.c)
         here = _point(points, g)
-        reverse_points(
-            g, here, rows, work, x, kept, bars, z_bar, d_bar, residual_bar, noise_bar
-        )
+        reverse_points(g, here, rows, work, x, kept, bars, z_bar, d_bar, residual_bar, noise_bar)
         found.poles[g] = bars.poles
         _copy(bars.c, found.C, g)
         q[g] = bars.q

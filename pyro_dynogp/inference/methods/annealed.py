@@ -17,7 +17,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -34,6 +33,7 @@ from pyro_dynogp.inference.density import (
 )
 from pyro_dynogp.inference.log_joint import Direct
 from pyro_dynogp.inference.pair_order import PairOrder
+from pyro_dynogp.inference.student_mixture import resample
 from pyro_dynogp.support.parallel import seeded
 
 # Effective share of particles after a step; one in so many of all particles starts a chain.
@@ -48,11 +48,8 @@ AT_ACCEPTANCE, SIZES, CHANGE = 0.179143, (1e-3, 1.5), (0.1, 4.0)
 # Logarithm of how far steps lie apart in the first move, and in the end.
 SPREAD = (1.2, 0.3)
 MOST_TEMPERATURES = 60
-# Degrees of freedom of the first particles around an optimum: tails wider than a normal's.
-FREEDOM = 20.0
 # Samples times particles that are evaluated at once.
 AT_ONCE = 400_000
-
 # Unconstrained values (logarithms of scales, mostly) beyond which a density counts as zero.
 REACH = 40.0
 
@@ -139,62 +136,6 @@ class Prior:
 
 
 @dataclass(frozen=True, eq=False)
-class StudentMixture:
-    """Multivariate Student-t distributions around optima, with the scales of normals there.
-
-    Attributes:
-        weights: (K,) that add up to one. loc: (K, d). scale_tril: (K, d, d), lower.
-    """
-
-    weights: Tensor
-    loc: Tensor
-    scale_tril: Tensor
-
-    @cached_property
-    def _inverse(self) -> Tensor:
-        """Inverses (K, d, d) of the roots, lower."""
-        eye = torch.eye(self.loc.shape[-1], dtype=self.loc.dtype)
-        return torch.linalg.solve_triangular(self.scale_tril, eye, upper=False)
-
-    def components(self, z: Tensor) -> Tensor:
-        """Log-densities (S, K) of the components, with their weights."""
-        return self._components(z)[0]
-
-    def _components(self, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """`components`; z off each centre in units of its root (K, S, d); its square (K, S)."""
-        d = z.shape[-1]
-        off = (z - self.loc.unsqueeze(1)) @ self._inverse.mT
-        square = off.square().sum(-1)
-        log_det = self._inverse.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        constant = math.lgamma(0.5 * (FREEDOM + d)) - math.lgamma(0.5 * FREEDOM)
-        constant -= 0.5 * d * math.log(FREEDOM * math.pi)
-        each = -0.5 * (FREEDOM + d) * torch.log1p(square / FREEDOM)
-        return (each.mT + constant + log_det + self.weights.log()), off, square
-
-    def log_prob(self, z: Tensor) -> Tensor:
-        """Value (S,) alone."""
-        return torch.logsumexp(self.components(z), -1)
-
-    def __call__(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Value (S,) and gradient (S, d)."""
-        each, off, square = self._components(z)
-        share = torch.softmax(each, -1).mT * (-(FREEDOM + z.shape[-1]) / (FREEDOM + square))
-        gradient = ((share.unsqueeze(-1) * off) @ self._inverse).sum(0)
-        return torch.logsumexp(each, -1), gradient
-
-    def draw(self, count: int, seed: int) -> Tensor:
-        """First particles (S, d), of each component in proportion to its weight."""
-        generator = torch.Generator().manual_seed(seed)
-        d = self.loc.shape[-1]
-        x = torch.randn(count, d, generator=generator, dtype=torch.float64)
-        # A chi-squared number by the sum of squares: torch's gamma takes no generator.
-        squares = torch.randn(count, int(FREEDOM), generator=generator, dtype=torch.float64)
-        spread = (FREEDOM / squares.square().sum(-1, keepdim=True)).sqrt()
-        k = _resample(self.weights.log(), count, generator)
-        return self.loc[k] + spread * torch.einsum("sij,sj->si", self.scale_tril[k], x)
-
-
-@dataclass(frozen=True, eq=False)
 class Annealed:
     """Particles of the target.
 
@@ -241,7 +182,7 @@ def anneal(
         step = _step(gain, 1.0 - b)
         weight = step * gain
         log_evidence += float(torch.logsumexp(weight, 0)) - float(np.log(len(gain)))
-        chosen = _resample(weight, chains, generator)
+        chosen = resample(weight, chains, generator)
         root = _root(now.z, torch.softmax(weight, 0))
         b = 1.0 if b + step > 1.0 - 1e-9 else b + step
         chain, states, rates = now.of(chosen), [], []
@@ -323,14 +264,6 @@ def _step(gain: Tensor, most: float) -> float:
     return max(low, 1e-6 * most)
 
 
-def _resample(log_weight: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Systematic resampling: indices (count,)."""
-    edges = torch.cumsum(torch.softmax(log_weight, 0), 0)
-    shift = torch.rand((), generator=generator, dtype=torch.float64)
-    at = (torch.arange(count, dtype=torch.float64) + shift) / count * edges[-1]
-    return torch.searchsorted(edges, at).clamp_max(len(log_weight) - 1)
-
-
 def _root(z: Tensor, weight: Tensor) -> Tensor:
     """Cholesky factor (d, d) of the covariance of weighted particles, shrunk to its diagonal."""
     d = z.shape[1]
@@ -351,9 +284,7 @@ def _move(
     spread: float,
     generator: torch.Generator,
 ) -> tuple[_Particles, Tensor, Tensor]:
-    """One Hamiltonian move of every particle.
-
-    Its step is `size` times a factor of its own, exp(-spread) to exp(spread).
+    """One Hamiltonian move of every particle, of `size` times a factor within exp(+-spread).
 
     Returns:
         The particles; chances (S,) with which they were accepted, and the factors (S,).
