@@ -12,8 +12,9 @@ ARGUMENTS = 12
 LINES = 31_500
 # The package of two versions before had 34 928; kernels in lanes, the density without tracing,
 # Gauss-Newton (1900 lines), nonlinear feedback (650 lines), known functions and branches (430
-# lines), integrators (450 lines) and checks of arguments came since. To shrink, and to go.
-LINES_TODAY = 40_800
+# lines), integrators (450 lines), checks of arguments, and densities of linear models without
+# tensors with draws in rounds (1700 lines) came since. To shrink, and to go.
+LINES_TODAY = 42_500
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

@@ -37,6 +37,7 @@ class Adapted:
         z: (S, d) draws of all rounds. log_target: (S,). log_proposal: (S,) of the mixture of all
             proposals. log_weights: (S,) normalised, smoothed. k: Pareto shape of the ratios.
         proposal: that the next round would have. rounds: how many there were.
+        settled: whether they gave enough draws.
     """
 
     z: Tensor
@@ -46,6 +47,7 @@ class Adapted:
     k: float
     proposal: StudentMixture
     rounds: int
+    settled: bool = False
 
     @property
     def effective(self) -> float:
@@ -61,16 +63,19 @@ def adapt(
     enough: Callable[[Adapted], bool],
     rounds: int,
 ) -> Adapted:
-    """Rounds of `count` draws until there are enough.
+    """Rounds of `count` draws until there are enough: in the first, or in two on end.
+
+    A k that is good once among many rounds is so by chance; a round that finds more of the target
+    raises it again.
 
     Args:
         start: first proposal. target: log-density. count: draws of a round. seed: of them.
-        enough: whether to stop. rounds: most.
+        enough: whether a round leaves enough. rounds: most.
     """
     proposals: list[StudentMixture] = []
     z = torch.zeros((0, start.loc.shape[1]), dtype=torch.float64)
     log_target, log_each = np.zeros(0), np.zeros((0, 0))
-    proposal = start
+    proposal, before = start, True
     while True:
         fresh = proposal.draw(count, seed + len(proposals))
         # Densities of proposals so far at fresh draws, and of the new one at all.
@@ -88,8 +93,10 @@ def adapt(
             log_weights, shape = psis(ratio)
             k = float(shape)
         found = Adapted(z, log_target, log_proposal, log_weights, k, proposal, len(proposals))
-        if enough(found) or not there:
-            return found
+        now = there and enough(found)
+        if (now and before) or not there:
+            return replace(found, settled=now)
+        before = now
         proposal = _shaped(proposal, z, _tempered(ratio, max(EFFECTIVE * count, EACH * z.shape[1])))
         if found.rounds == rounds:
             return replace(found, proposal=proposal)

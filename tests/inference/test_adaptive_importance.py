@@ -88,9 +88,14 @@ def test_rounds_end_when_there_is_enough():
     def target(z):
         return normal(z, [0.0], [1.0]).numpy()
 
-    found = adapt(student([[0.0]]), target, 100, 0, lambda now: now.rounds == 2, 8)
-    assert found.rounds == 2
-    assert torch.equal(found.z, adapt(student([[0.0]]), target, 100, 0, never, 2).z)
+    def ended(*rounds):
+        return adapt(student([[0.0]]), target, 100, 0, lambda now: now.rounds in rounds, 6)
+
+    assert (ended(1).rounds, ended(1).settled) == (1, True)  # looked at once
+    assert (ended(3).rounds, ended(3).settled) == (6, False)  # a chance among several
+    assert (ended(3, 4).rounds, ended(3, 4).settled) == (4, True)
+    assert (ended(6).rounds, ended(6).settled) == (6, False)
+    assert torch.equal(ended(3, 4).z, adapt(student([[0.0]]), target, 100, 0, never, 4).z)
 
 
 def test_nothing_to_shape_by():
