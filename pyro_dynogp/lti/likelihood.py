@@ -69,6 +69,22 @@ class Tape(NamedTuple):
     kept: layout.Kept
 
 
+class _Bars(NamedTuple):
+    """Gradients by all that the groups have: z and d, residuals, noise, and in lanes the rest.
+
+    found, q, state: by gains, q and start of the innovations; held: by gains of the residuals.
+    """
+
+    z: np.ndarray
+    d: np.ndarray
+    residual: np.ndarray
+    noise: np.ndarray
+    found: Gains
+    q: np.ndarray
+    state: np.ndarray
+    held: Gains
+
+
 def innovations_of(
     systems: Systems, signals: Signals, missing: np.ndarray, past: Past, *, keep: bool
 ) -> tuple[np.ndarray, np.ndarray, Tape]:
@@ -111,10 +127,8 @@ def gradients(tape: Tape, z_bar: np.ndarray, d_bar: np.ndarray) -> Systems:
     found = Gains(*(np.zeros_like(each) for each in gains))
     held = Gains(*(np.zeros_like(each) for each in gains))
     q, state = np.zeros_like(points.q), np.zeros_like(points.start)
-    _reverse(
-        gains, signals, own, points, rows, work, x, bars, kept, z_bar, d_bar, residual_bar,
-        noise_bar, found, q, state, held,
-    )  # fmt: skip
+    all_bars = _Bars(z_bar, d_bar, residual_bar, noise_bar, found, q, state, held)
+    _reverse(gains, signals, own, points, rows, work, x, bars, kept, all_bars)
     poles_bar = from_lanes(found.poles + held.poles, k).view(complex)
     C_bar = from_lanes(found.C + held.C, k).view(complex).reshape(k, n_y, P)
     driven_bar = from_lanes(held.B, k).view(complex).reshape(k, P, -1)
@@ -200,11 +214,8 @@ def _forward(gains, signals, own, points, rows, work, x, z, d, kept):
 
 
 @njit(**OPTIONS)
-def _reverse(
-    gains, signals, own, points, rows, work, x, bars, kept, z_bar, d_bar, residual_bar, noise_bar,
-    found, q, state, held,
-):  # fmt: skip
-    """Gradients of each group: by innovations in `found`, q and state, by residuals in `held`."""
+def _reverse(gains, signals, own, points, rows, work, x, bars, kept, every):
+    """Gradients of each group, written to those of all of them."""
     for g in range(gains.poles.shape[0]):
         _fresh(work, x)
         for part in (bars.poles, bars.q, bars.state, bars.held, bars.inject, bars.later, bars.w,
@@ -212,10 +223,11 @@ def _reverse(
             part[:] = 0.0
         _clear(bars.c)
         here = _point(points, g)
-        reverse_points(g, here, rows, work, x, kept, bars, z_bar, d_bar, residual_bar, noise_bar)
-        found.poles[g] = bars.poles
-        _copy(bars.c, found.C, g)
-        q[g] = bars.q
-        state[g] = bars.state[: state.shape[1]]
+        z, d, residual, noise = every.z, every.d, every.residual, every.noise
+        reverse_points(g, here, rows, work, x, kept, bars, z, d, residual, noise)
+        every.found.poles[g] = bars.poles
+        _copy(bars.c, every.found.C, g)
+        every.q[g] = bars.q
+        every.state[g] = bars.state[: every.state.shape[1]]
         respond(g, gains, signals, own, rows.residual)
-        reverse_respond(g, gains, signals, own, held, residual_bar)
+        reverse_respond(g, gains, signals, own, every.held, residual)
