@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.distributions import biject_to
 from torch.distributions.transforms import Transform
 
+from pyro_dynogp.inference.linear_density import LinearEnergy, linear_density
 from pyro_dynogp.inference.log_joint import LogJoint, density_of
 from pyro_dynogp.inference.optimise.descent import WIDEST, bounded_root, descend, hessian
 from pyro_dynogp.layers.sites import Arguments, Program
@@ -24,6 +25,8 @@ WALL = 1e15
 # Samples in all, over the points of a batch, up to which more points cost less than one by one:
 # above, the compiled recursions are what an evaluation costs.
 AT_ONCE = 12_000
+# So many times as many of a linear model, whose points need next to no memory.
+LINEAR = 8
 # Most iterations to the mode of the unconstrained vector's density.
 LAPLACE_STEPS = 120
 
@@ -88,6 +91,17 @@ def each_with_gradient(energy: Callable[[Tensor], Tensor], z: Tensor) -> tuple[T
     return value.detach().masked_fill(bad, torch.inf), gradient.masked_fill(bad[:, None], 0.0)
 
 
+def energies_of(energy: Callable[[Tensor], Tensor], z: Tensor) -> Tensor:
+    """Energies (k,) at z (k, d) without gradient, infinite where there are none."""
+    try:
+        with torch.no_grad(), pyro.validation_enabled(False):
+            return energy(z).nan_to_num(torch.inf, torch.inf, torch.inf)
+    except (NotPositiveDefiniteError, torch.linalg.LinAlgError, ValueError):
+        if len(z) == 1:
+            return torch.full((1,), torch.inf, dtype=torch.float64)
+        return torch.cat([energies_of(energy, half) for half in z.tensor_split(2)])
+
+
 @contextlib.contextmanager
 def denormals_flushed() -> Iterator[None]:
     """Inside, numbers below 1e-308 are zero; outside nothing has changed.
@@ -125,6 +139,8 @@ class Potential:
     def __init__(self, model: Program, args: Arguments, values: Mapping[str, Tensor]) -> None:
         self.model, self.args, self.at = model, args, dict(values)
         self.log_density = density_of(model, args)
+        # The same without tensors, where there is such a form.
+        self.linear = linear_density(self.log_density)
         self.sites: list[Site] = []
         latent, count = self.log_density.latent(values)
         for name, prior, value in latent:
@@ -134,6 +150,8 @@ class Potential:
         # Points that are evaluated at once.
         batches = getattr(model, "takes_batches", False)
         self.width = max(1, AT_ONCE // max(count, 1)) if batches else 1
+        if self.linear is not None:
+            self.width *= LINEAR
 
     @property
     def size(self) -> int:
@@ -166,6 +184,10 @@ class Potential:
 
         Of the values, or with `jacobian` of the unconstrained vector.
         """
+        if self.linear is not None:
+            points = z if z.dim() > 1 else z[None]
+            energy: Tensor = LinearEnergy.apply(points, self.linear, jacobian)
+            return energy if z.dim() > 1 else energy[0]
         return joint_energy(self.log_density, self.sites, z, jacobian=jacobian)
 
     def log_jacobian(self, z: Tensor) -> Tensor:

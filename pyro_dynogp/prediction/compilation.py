@@ -74,6 +74,8 @@ def _exact() -> None:
         plant = _Plant.of(LinearDynamicGP(1, outputs=outputs, pairs=1))
         plant.climb()
         plant.look()
+        # Densities of models whose first state is a site go through tensors.
+        _Plant.of(LinearDynamicGP(1, outputs=outputs, pairs=1, initial_state="site")).climb()
 
 
 def _filter() -> None:

@@ -12,7 +12,14 @@ from scipy.stats import f
 import pyro_dynogp as dgp
 from pyro_dynogp.criticism.left_out import spread_of
 from pyro_dynogp.inference.density import Potential
-from pyro_dynogp.inference.methods.annealed import FREEDOM, Joint, StudentMixture, anneal
+from pyro_dynogp.inference.methods.annealed import (
+    ACCEPTANCE,
+    CHANGE,
+    Joint,
+    _next_size,
+    anneal,
+)
+from pyro_dynogp.inference.student_mixture import FREEDOM, StudentMixture
 
 
 def tensor(x):
@@ -199,3 +206,25 @@ def test_the_error_of_a_mean_is_its_spread_over_seeds():
     spread = np.std(shares)
     assert np.mean(naive) < 0.8 * spread
     assert np.mean(errors) == pytest.approx(spread, rel=0.3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_step_sizes_are_those_at_which_moves_would_be_accepted(seed):
+    """Of chances erfc(c h^2) the next step has the chance aimed at, whatever c is."""
+    generator = torch.Generator().manual_seed(seed)
+    factor = (2.4 * torch.rand(200, generator=generator, dtype=torch.float64) - 1.2).exp()
+    for c in (0.02, 0.3, 5.0, 40.0):
+        chance = torch.erfc(c * (0.5 * factor).square())
+        size = _next_size(0.5, factor, chance)
+        assert math.erfc(c * size**2) == pytest.approx(ACCEPTANCE, abs=1e-4) or size == 1.5
+    assert _next_size(0.5, factor, torch.zeros(200).double()) == pytest.approx(0.5 * CHANGE[0])
+    assert _next_size(0.1, factor, torch.ones(200).double()) == pytest.approx(0.1 * CHANGE[1])
+
+
+def test_steps_that_are_far_too_long_at_first_are_shortened_at_once():
+    """A target a thousand times narrower than its start: nearly all moves count."""
+    narrow = Known(lambda z: standard(z / 1e-3) - 2 * math.log(1e-3))
+    found = anneal(normal(2000, 2), Known(standard), narrow)
+    assert found.log_evidence == pytest.approx(0.0, abs=0.8)
+    assert np.mean(found.acceptance[1:]) == pytest.approx(ACCEPTANCE, abs=0.08)
+    assert float(found.z.std()) == pytest.approx(1e-3, rel=0.2)

@@ -14,18 +14,26 @@ compiled recursions do.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 import torch
-from pyro.distributions import MultivariateStudentT
 from torch import Tensor
 from tqdm import tqdm
 
-from pyro_dynogp.inference.density import Potential, each_with_gradient, within_edges
+from pyro_dynogp.inference.density import (
+    Potential,
+    denormals_flushed,
+    each_with_gradient,
+    energies_of,
+    within_edges,
+)
 from pyro_dynogp.inference.log_joint import Direct
+from pyro_dynogp.inference.pair_order import PairOrder
+from pyro_dynogp.inference.student_mixture import resample
 from pyro_dynogp.support.parallel import seeded
 
 # Effective share of particles after a step; one in so many of all particles starts a chain.
@@ -35,12 +43,13 @@ EFFECTIVE, CHAINS = 0.5, 4
 MOVES = 2
 # Leapfrog steps of a move, at random between these; acceptance that the step size aims at.
 LEAPS, ACCEPTANCE = (3, 8), 0.8
+# x of erfc(x) = ACCEPTANCE; step sizes, and largest changes of them.
+AT_ACCEPTANCE, SIZES, CHANGE = 0.179143, (1e-3, 1.5), (0.1, 4.0)
+# Logarithm of how far steps lie apart in the first move, and in the end.
+SPREAD = (1.2, 0.3)
 MOST_TEMPERATURES = 60
-# Degrees of freedom of the first particles around an optimum: tails wider than a normal's.
-FREEDOM = 20.0
 # Samples times particles that are evaluated at once.
 AT_ONCE = 400_000
-
 # Unconstrained values (logarithms of scales, mostly) beyond which a density counts as zero.
 REACH = 40.0
 
@@ -58,14 +67,32 @@ class Joint:
 
     Attributes:
         potential: the density. samples: of the data.
+        order: of the pairs, outside of which the density counts as zero; None for all orders.
     """
 
     potential: Potential
     samples: int = 1
+    order: PairOrder | None = None
+
+    def log_prob(self, z: Tensor) -> np.ndarray:
+        """Value (S,) alone."""
+        far = self._far(z)
+        near = z.masked_fill(far[:, None], 0.0)
+        with torch.no_grad(), denormals_flushed():
+            portions = near.split(max(1, AT_ONCE // self.samples))
+            energy = torch.cat([energies_of(self._energy, portion) for portion in portions])
+        return (-energy.masked_fill(far, torch.inf)).numpy()
+
+    def _far(self, z: Tensor) -> Tensor:
+        """Where the density counts as zero (S,)."""
+        far = ~(z.abs() <= REACH).all(-1)
+        if self.order is not None:
+            far |= ~torch.from_numpy(self.order.holds(z.numpy()))
+        return far
 
     def __call__(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Value (S,) and gradient (S, d)."""
-        far = ~(z.abs() <= REACH).all(-1)
+        far = self._far(z)
         near = z.masked_fill(far[:, None], 0.0)
         portions = near.split(max(1, AT_ONCE // self.samples))
         found = [each_with_gradient(self._energy, portion) for portion in portions]
@@ -109,46 +136,6 @@ class Prior:
 
 
 @dataclass(frozen=True, eq=False)
-class StudentMixture:
-    """Multivariate Student-t distributions around optima, with the scales of normals there.
-
-    Attributes:
-        weights: (K,) that add up to one. loc: (K, d). scale_tril: (K, d, d), lower.
-    """
-
-    weights: Tensor
-    loc: Tensor
-    scale_tril: Tensor
-
-    @property
-    def distribution(self) -> MultivariateStudentT:
-        """Of all components, as Pyro has it."""
-        freedom = torch.tensor(FREEDOM, dtype=torch.float64)
-        return MultivariateStudentT(freedom, self.loc, self.scale_tril)
-
-    def __call__(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Value (S,) and gradient (S, d)."""
-        each = self.distribution.log_prob(z.unsqueeze(1)) + self.weights.log()  # (S, K)
-        off = (z.unsqueeze(1) - self.loc).permute(1, 2, 0)  # (K, d, S)
-        departure = torch.cholesky_solve(off, self.scale_tril)
-        square = (off * departure).sum(1, keepdim=True)
-        slopes = -(FREEDOM + z.shape[-1]) * departure / (FREEDOM + square)
-        gradient = torch.einsum("sk,kds->sd", torch.softmax(each, -1), slopes)
-        return torch.logsumexp(each, -1), gradient
-
-    def draw(self, count: int, seed: int) -> Tensor:
-        """First particles (S, d), of each component in proportion to its weight."""
-        generator = torch.Generator().manual_seed(seed)
-        d = self.loc.shape[-1]
-        x = torch.randn(count, d, generator=generator, dtype=torch.float64)
-        # A chi-squared number by the sum of squares: torch's gamma takes no generator.
-        squares = torch.randn(count, int(FREEDOM), generator=generator, dtype=torch.float64)
-        spread = (FREEDOM / squares.square().sum(-1, keepdim=True)).sqrt()
-        k = _resample(self.weights.log(), count, generator)
-        return self.loc[k] + spread * torch.einsum("sij,sj->si", self.scale_tril[k], x)
-
-
-@dataclass(frozen=True, eq=False)
 class Annealed:
     """Particles of the target.
 
@@ -179,7 +166,7 @@ def anneal(
     count = len(z)
     chains = -(-count // CHAINS)
     now = _evaluate(z, start, target, 0.0, torch.arange(count))
-    b, log_evidence, size = 0.0, 0.0, 0.5
+    b, log_evidence, size, spread = 0.0, 0.0, 0.5, SPREAD[0]
     temperatures: list[float] = []
     accepted: list[float] = []
     bar = tqdm(desc="annealing", disable=not progress, total=100)
@@ -195,16 +182,16 @@ def anneal(
         step = _step(gain, 1.0 - b)
         weight = step * gain
         log_evidence += float(torch.logsumexp(weight, 0)) - float(np.log(len(gain)))
-        chosen = _resample(weight, chains, generator)
+        chosen = resample(weight, chains, generator)
         root = _root(now.z, torch.softmax(weight, 0))
         b = 1.0 if b + step > 1.0 - 1e-9 else b + step
         chain, states, rates = now.of(chosen), [], []
         for _ in range(MOVES if b < 1.0 else MOVES + CHAINS):
-            chain, rate = _move(chain, start, target, b, root, size, generator)
-            # Particles tell at once how many of them were accepted.
-            size = float(np.clip(size * np.exp(rate - ACCEPTANCE), 1e-3, 1.5))
+            chain, chance, factor = _move(chain, start, target, b, root, size, spread, generator)
+            size = _next_size(size, factor, chance)
+            spread = max(0.5 * spread, SPREAD[1])
             states.append(chain)
-            rates.append(rate)
+            rates.append(float(chance.mean()))
         now = _Particles.joined(states if b < 1.0 else states[MOVES:])
         temperatures.append(b)
         accepted.append(float(np.mean(rates)))
@@ -277,14 +264,6 @@ def _step(gain: Tensor, most: float) -> float:
     return max(low, 1e-6 * most)
 
 
-def _resample(log_weight: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Systematic resampling: indices (count,)."""
-    edges = torch.cumsum(torch.softmax(log_weight, 0), 0)
-    shift = torch.rand((), generator=generator, dtype=torch.float64)
-    at = (torch.arange(count, dtype=torch.float64) + shift) / count * edges[-1]
-    return torch.searchsorted(edges, at).clamp_max(len(log_weight) - 1)
-
-
 def _root(z: Tensor, weight: Tensor) -> Tensor:
     """Cholesky factor (d, d) of the covariance of weighted particles, shrunk to its diagonal."""
     d = z.shape[1]
@@ -302,14 +281,20 @@ def _move(
     b: float,
     root: Tensor,
     size: float,
+    spread: float,
     generator: torch.Generator,
-) -> tuple[_Particles, float]:
-    """One Hamiltonian move of every particle, and the share that was accepted."""
+) -> tuple[_Particles, Tensor, Tensor]:
+    """One Hamiltonian move of every particle, of `size` times a factor within exp(+-spread).
+
+    Returns:
+        The particles; chances (S,) with which they were accepted, and the factors (S,).
+    """
     count, d = now.z.shape
     low, high = LEAPS
     leaps = int(torch.randint(low, high + 1, (), generator=generator))
-    jitter = 0.7 + 0.6 * torch.rand(count, 1, generator=generator, dtype=torch.float64)
-    h = size * jitter * d**-0.25
+    uniform = torch.rand(count, 1, generator=generator, dtype=torch.float64)
+    factor = (spread * (2.0 * uniform - 1.0)).exp()
+    h = size * factor * d**-0.25
     momentum = torch.randn(count, d, generator=generator, dtype=torch.float64)
     value, gradient = now.at(b)
     energy = value - 0.5 * momentum.square().sum(-1)
@@ -323,5 +308,21 @@ def _move(
     change = torch.nan_to_num(change, nan=-torch.inf)
     chance = torch.rand(count, generator=generator, dtype=torch.float64).log()
     accept = chance < change
-    rate = float(change.clamp_max(0.0).exp().mean())
-    return there.where(accept, now), rate
+    return there.where(accept, now), change.clamp_max(0.0).exp(), factor[:, 0]
+
+
+def _next_size(size: float, factor: Tensor, chance: Tensor) -> float:
+    """Step size at which `ACCEPTANCE` of the moves would have been accepted.
+
+    Errors of the energy grow with the square of a step h, so that the chance is erfc(c h^2)
+    (Beskos, Pillai, Roberts, Sanz-Serna & Stuart, Bernoulli 19:1501, 2013); c is such that chances
+    of moves with steps of all lengths have the mean that they have.
+    """
+    square, mean = factor.square(), chance.mean()
+    low, high = -12.0, 12.0  # of log c
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        over = bool(torch.erfc(math.exp(middle) * square).mean() > mean)
+        low, high = (middle, high) if over else (low, middle)
+    change = math.sqrt(AT_ACCEPTANCE * math.exp(-0.5 * (low + high)))
+    return float(np.clip(size * np.clip(change, *CHANGE), *SIZES))

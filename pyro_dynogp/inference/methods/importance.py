@@ -25,12 +25,14 @@ class Importance:
     """Draws of all parameters: importance sampling around the optima, annealed where that fails.
 
     Optima are found as by `Mode`. Draws of Student-t distributions around up to four of them get
-    weights by the posterior; where Pareto's k of the weights is too high, and the model has no
-    static functions, they are annealed to it (`inference.importance_sampling`). Bands then know
-    the uncertainty of every parameter, and each optimum has its posterior probability.
+    weights by the posterior. Where Pareto's k of the weights is too high, rounds of draws of a
+    linear model under Gaussian noise shape the distributions; where it stays too high, and the
+    model has no static functions, draws are annealed to the posterior
+    (`inference.importance_sampling`). Bands then know the uncertainty of every parameter, and each
+    optimum has its posterior probability.
 
-    Annealing takes several times as long as the climbs, and matters less the longer a record is.
-    Along more than `longest` samples, where k asks for it, the fit is the posterior mode instead.
+    Annealing takes longer than the climbs, and matters less the longer a record is. Along more than
+    `longest` samples, where k asks for it, the fit is the posterior mode instead.
 
     Attributes:
         draws: posterior draws to keep, of equal weight.
@@ -76,16 +78,16 @@ def with_draws_around(
         seed=run.seed,
         progress=run.progress,
     )
-    good = good_k(len(found.draws))
-    failed = not found.annealed and not found.k <= good
+    failed = not found.annealed and not found.trusted
     if failed and not problem.model.has_function and samples_of(problem.records) > longest:
         mode = at_optimum(problem.model, optima, run.seed, problem.records)
         return replace(mode, diagnostics=FrozenMapping({**mode.diagnostics, "pareto_k": found.k}))
     if failed:
+        good = good_k(len(found.draws))
         warn(
-            f"fit: Pareto's k of the posterior's draws is {found.k:.2f} (good: up to {good:.2f}): "
-            "do not trust their weights, and bands made of them. Use method='nuts' or 'svi', or a "
-            "smaller model."
+            f"fit: Pareto's k of the posterior's draws is {found.k:.2f} (good: up to {good:.2f}), "
+            f"and they say as much as {found.independent:.0f} independent ones: do not trust their "
+            "weights, and bands made of them. Use method='nuts' or 'svi', or a smaller model."
         )
     values = FrozenMapping(found.resampled(draws))
     diagnostics = {

@@ -98,6 +98,7 @@ class Innovations:
     def __init__(self, potential: Potential) -> None:
         assert isinstance(potential.log_density, Direct)
         self.potential, self.density = potential, potential.log_density
+        self._linear = potential.linear
         self._there = [~torch.isnan(y) for y in self.density.observations]
         model = self.density.model
         states = sum(2 * layer.modes for _, layer in model.dynamic)
@@ -108,8 +109,7 @@ class Innovations:
     def energies(self, z: np.ndarray) -> np.ndarray:
         """Energies (k,) at z (k, d); infinite where there is none."""
         innovated = self._innovations(z)
-        with torch.no_grad():
-            prior = self._prior(torch.tensor(z)).numpy()
+        prior = self._prior(z)[0]
         with np.errstate(all="ignore"):
             return _finite(prior + _energies(innovated))
 
@@ -118,10 +118,7 @@ class Innovations:
         points = np.concatenate([z[None], z + STEP * np.eye(len(z))])
         innovated = self._innovations(points)
         errors, variances, rest = innovated
-        x = torch.tensor(points, requires_grad=True)
-        with torch.enable_grad():
-            prior = self._prior(x)
-            gradients = torch.autograd.grad(prior.sum(), x)[0].numpy()
+        prior, gradients = self._prior(points)
         with np.errstate(all="ignore"):
             sd = np.sqrt(variances[0])
             level = np.stack([errors / sd, np.log(variances) * math.sqrt(0.5)])
@@ -130,7 +127,7 @@ class Innovations:
             weights = np.stack([first[0], math.sqrt(0.5) * (1.0 - first[0] ** 2)])
             gradient = gradients[0] + sum(J @ w for J, w in zip(slopes, weights, strict=True))
             gradient -= (rest[1:] - rest[0]).sum(1) / STEP
-            energy = float(prior[0].detach()) + float(_energies(innovated)[0])
+            energy = float(prior[0]) + float(_energies(innovated)[0])
             curvature = (gradients[1:] - gradients[0]) / STEP
             curvature = 0.5 * (curvature + curvature.T)
             fisher = sum(J @ J.T for J in slopes)
@@ -150,13 +147,21 @@ class Innovations:
         ]
         return np.nan_to_num(sum(parts), posinf=0.0, neginf=0.0)
 
-    def _prior(self, z: Tensor) -> Tensor:
-        """Energies (k,) of the prior at z (k, d)."""
-        with pyro.validation_enabled(False):
-            return -self.density.prior.log_prob(self.potential.unpack(z))
+    def _prior(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Energies (k,) of the prior at z (k, d), and their gradients (k, d)."""
+        if self._linear is not None:
+            return self._linear.prior_energies(z)
+        x = torch.tensor(z, requires_grad=True)
+        with torch.enable_grad(), pyro.validation_enabled(False):
+            energies = -self.density.prior.log_prob(self.potential.unpack(x))
+            (gradients,) = torch.autograd.grad(energies.sum(), x)
+        return energies.detach().numpy(), gradients.numpy()
 
     def _innovations(self, z: np.ndarray) -> Innovated:
         """Of the measured samples at z (k, d)."""
+        if self._linear is not None:
+            errors, variances = self._linear.innovations(z)
+            return Innovated(errors, variances, np.zeros((len(z), 1)))
         portions = [self._portion(torch.tensor(part)) for part in
                     np.split(z, range(self.width, len(z), self.width))]  # fmt: skip
         return Innovated(*(np.concatenate(part) for part in zip(*portions, strict=True)))
