@@ -11,6 +11,7 @@ import torch
 
 from pyro_dynogp.criticism.calibration import calibration
 from pyro_dynogp.criticism.finding import Finding, apart
+from pyro_dynogp.criticism.leave_future_out import forecast_findings
 from pyro_dynogp.criticism.posterior_draws import DRAWS, draws_of
 from pyro_dynogp.criticism.twin import twin_findings
 from pyro_dynogp.inference.fitted import known_fit
@@ -75,12 +76,13 @@ def check(
     fit: Fitted,
     *,
     twin: int | Literal[False] = False,
+    forecasts: bool = True,
     draws: int = DRAWS,
     seed: int = 0,
     workers: int | None = None,
     progress: bool = True,
 ) -> Check:
-    """Check the posterior of a fit and its one-step predictions of the training record.
+    """Check the posterior of a fit, its one-step predictions and forecasts of the training record.
 
     - Pareto's k of the posterior (Yao, Vehtari, Simpson & Gelman 2018), with trajectories
       integrated out: below 0.5 the approximation is close to the posterior, up to good_k it can
@@ -91,6 +93,8 @@ def check(
     - ELBO: whether it still rose at the end. Starts: whether another one came to the same optimum.
     - Poles: those that hardly decay within the record, and records of unstable plants.
     - One-step predictions: calibrated on the training record (see `calibration`).
+    - Forecasts: of later parts of the training record by refits to what came before them (see
+      `leave_future_out`). What holds one step ahead need not hold in a free run.
     - With `twin`: a fit of the same model, scaling and method to the first samples alone (from the
       optima of this fit), against NUTS on them. Means of the sites (unconstrained: logarithms of
       scales) are good within 0.5 of NUTS's sds and sds within a factor 1.5, the worst site
@@ -102,6 +106,7 @@ def check(
         fit: the fit.
         twin: False, or the number of samples of the twin; 100 to 200 are a compromise. NUTS takes
             about four minutes of one core for 120 samples and a linear model of one pair.
+        forecasts: whether to fit twice more, to parts of the record, and forecast the rest.
         draws: for Pareto's k, by default those that `loo` takes. seed: for them and for NUTS.
         workers: processes for NUTS's chains. progress: whether NUTS shows a bar.
 
@@ -124,7 +129,10 @@ def check(
         findings.append(_elbo(fit))
     findings.append(_starts(fit))
     findings += [Finding("poles", np.nan, False, sentence) for sentence in warnings_of(fit)]
-    findings += _predictions(fit) + compared
+    findings += _predictions(fit)
+    if forecasts:
+        findings += forecast_findings(fit, seed=seed)
+    findings += compared
     return Check(tuple(findings), fit.method)
 
 

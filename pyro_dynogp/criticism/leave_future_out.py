@@ -1,0 +1,119 @@
+"""Forecasts of later parts of a training record by refits to what came before them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pyro_dynogp.criticism.finding import Finding
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.inference.refit import refit
+from pyro_dynogp.inference.run import Run
+from pyro_dynogp.prediction.predict import forecast
+
+if TYPE_CHECKING:
+    from pyro_dynogp.inference.fitted import Fitted
+
+# Shares of the record between which it is cut: two refits, each forecasts up to the next cut.
+CUTS = (0.6, 0.8, 1.0)
+# Fewest samples of the shortest record of which parts are left out.
+FEWEST = 60
+# Share of samples inside the 95 % interval from which forecasts do not hold, and the probability of
+# as few, were they right, from which that is no chance.
+HOLDS, CHANCE = 0.8, 0.05
+# Joint samples that say what chance is.
+SAMPLES = 400
+NAME = "forecasts"
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """A forecast of a part of a record.
+
+    Attributes:
+        inside: number of measured outputs in their central 95 % interval. count: of all.
+        chance: (S,) the same number for joint samples of the forecast in their place.
+    """
+
+    inside: int
+    count: int
+    chance: np.ndarray
+
+
+def forecast_findings(fit: Fitted, *, seed: int = 0) -> list[Finding]:
+    """Whether forecasts hold, from within the training record (leave-future-out).
+
+    The model is fitted again, by the same method, to the first 60 and the first 80 % of every
+    record, and forecasts the 20 % that follow from the state at their beginning. They do not hold
+    where the 95 % interval has less than 80 % of the samples, and as few are improbable were the
+    forecasts right: joint samples in the place of the outputs say so, whose errors go together in a
+    free run. Those of models with functions go together too little: the share alone decides.
+
+    Source: leave-future-out validation (Buerkner, Gabry & Vehtari, J. Stat. Comput. Simul. 90(14):
+    2499, 2020).
+
+    Args:
+        fit: the fit. seed: of joint samples.
+    """
+    shortest = min(len(record) for record in fit.records)
+    if not fit.collapsed or fit.method == "nuts":
+        text = "not looked at: the model would have to be sampled again; see calibration()"
+        return [Finding(NAME, np.nan, None, text)]
+    if shortest < FEWEST:
+        text = f"not looked at: {FEWEST} samples or more are needed, there are {shortest}"
+        return [Finding(NAME, np.nan, None, text)]
+    stretches: list[Stretch] = []
+    for cut, end in pairwise(CUTS):
+        try:
+            stretches += _ahead(fit, cut, end, seed)
+        except ValueError as error:  # as where an input is constant before the cut
+            text = f"not looked at: the first {100 * cut:.0f} % cannot be fitted alone ({error})"
+            return [Finding(NAME, np.nan, None, text)]
+    return [_finding(stretches, fit.model.is_linear)] if stretches else []
+
+
+def _ahead(fit: Fitted, cut: float, end: float, seed: int) -> list[Stretch]:
+    """Forecasts from `cut` to `end`, shares of every record."""
+    past = [record[: int(cut * len(record))] for record in fit.records]
+    future = [record[int(cut * len(record)) : int(end * len(record))] for record in fit.records]
+    again = refit(fit, past, run=Run(fit.seed, workers=1))
+    return [
+        _stretch(again, before, after, seed)
+        for before, after in zip(past, future, strict=True)
+        if np.isfinite(after.outputs).any(0).all()
+    ]
+
+
+def _stretch(fit: Fitted, past: Record, future: Record, seed: int) -> Stretch:
+    predicted = forecast(fit, past, future, samples=SAMPLES, seed=seed)
+    low, high = predicted.quantile(0.025), predicted.quantile(0.975)
+    y = future.outputs
+    there = np.isfinite(y)
+    both = np.concatenate([y[None], predicted.samples])
+    inside = ((low <= both) & (both <= high) & there).sum((1, 2))
+    return Stretch(int(inside[0]), int(there.sum()), inside[1:])
+
+
+def _finding(stretches: list[Stretch], known: bool) -> Finding:
+    """What stretches say; `known`: whether errors of joint samples go together as they should."""
+    count = sum(one.count for one in stretches)
+    inside = sum(one.inside for one in stretches)
+    as_few = (np.sum([one.chance for one in stretches], axis=0) <= inside).sum()
+    p = float((1 + as_few) / (1 + len(stretches[0].chance)))
+    share = inside / count
+    bad = share < HOLDS and (p < CHANCE or not known)
+    each = " and ".join(f"{100 * one.inside / one.count:.0f} %" for one in stretches)
+    text = (
+        f"of later parts by refits to what came before: the 95 % interval holds {each} of the "
+        f"samples"
+    )
+    text += f" (as few by chance: p = {p:.2g})" if known else ""
+    if bad:
+        text += (
+            ". Free runs and forecasts are not to be trusted: see what the model lacks "
+            "(close_loop), or try another structure"
+        )
+    return Finding(NAME, share, not bad, text, HOLDS)
