@@ -176,7 +176,7 @@ class Scaling:
 
 
 # Samples below which a record is short: it may show a part of what the system does.
-SHORT = 150.0
+SHORT = 100.0
 
 
 @dataclass(frozen=True)
