@@ -16,6 +16,7 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.effects.base import Parameters
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.methods.numbers import Number, number_posterior
+from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.lti.views import steady_state_gain
 from pyro_dynogp.models.delays import where_inputs_are_known
 from pyro_dynogp.models.model import Model
@@ -42,13 +43,18 @@ def parameters_of(fit: Fit, channels: Sequence[Channel], record: Record) -> Para
     present = [one for one in channels if one in fit.model.channels]
     acting = [one for one in present if one.direct or not one.replaces]
     if acting and fit.model.outputs == 1:
-        drawn = fit.draws
-        if fit.method == "map":
-            drawn = draws_of(fit, count=DRAWS, seed=0, anneal=False).values
+        drawn = _drawn(fit)
         out |= _weights(fit, acting, drawn) | _gains(fit, acting, drawn)
     for group in _together(present):
         out |= _numbers(fit, group, record)
     return out
+
+
+def _drawn(fit: Fit) -> Mapping[str, Tensor]:
+    """Draws of all sites: those of the fit, or around its mode where it keeps sites there."""
+    if not isinstance(fit.posterior, Mixture) or not fit.posterior.points:
+        return fit.draws
+    return draws_of(fit.at_mode(), count=DRAWS, seed=0, anneal=False).values
 
 
 def _weights(fit: Fit, channels: Sequence[Channel], drawn: Mapping[str, Tensor]) -> Parameters:
@@ -114,7 +120,8 @@ def _numbers(fit: Fit, group: Sequence[Channel], record: Record) -> Parameters:
         Number(
             getattr(first, field),
             _step(first, quantity, whole),
-            quantity.low,
+            max(quantity.low, float(whole.time[0])) if quantity.inside else quantity.low,
+            float(whole.time[-1]) if quantity.inside else np.inf,
             cell=_cell(fit.model, first, whole),
         )
         for field, quantity in first.numbers.items()

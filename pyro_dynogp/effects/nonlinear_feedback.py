@@ -97,7 +97,9 @@ class NonlinearFeedbackOfOutput(Effect):
         The input that holds the output at y is u(y) = (y - G_f f(y)) / G_u, with steady-state gains
         G_u from the input and G_f from what comes back. Posterior mean and standard deviation of
         its mean slope in each part of the output's range [input / output]; of the input with the
-        largest gain. None for several outputs, for integrators, and without inputs.
+        largest gain. Standard deviations are those of the fit's draws: by default they know the
+        function alone, as poles and gains stay at their optimum. None for several outputs, for
+        integrators, and without inputs.
         """
         model, scaling = fit.model, fit.scaling
         fed = [wire for wire in model.wires if wire.feedback]

@@ -214,3 +214,33 @@ def test_limits_of_a_sensor():
 
 def evidence_of(where, effect="saturation"):
     return Evidence(effect, 3.0, 0.01, 5.0, 0.1, where, "It stops.")
+
+
+def test_an_instant_that_data_do_not_tell_stays_within_the_record():
+    """A step of next to nothing: any instant does, none outside the record is one."""
+    rng = np.random.default_rng(3)
+    n = 120
+    u = signal(3, n)
+    y = lfilter([0.0, 0.2], [1.0, -0.8], u) + 0.1 * rng.standard_normal(n)
+    record = dgp.Record(time=5.0 + 0.1 * np.arange(n), inputs=u, outputs=y, time_unit="s")
+    step = Step(9.0)
+    model = with_channel(dgp.LinearDynamicGP(1, pairs=1), step)
+    fit = dgp.fit(model, record, method="map", workers=1, progress=False)
+    mean, sd = parameters_of(fit, [step], record)["instant [s]"]
+    assert record.time[0] <= mean <= record.time[-1]
+    assert 0.5 < sd < record.duration
+
+
+def test_weights_of_cascades_have_standard_deviations_too():
+    """Their fits keep the weights of direct inputs at the mode."""
+    rng = np.random.default_rng(4)
+    n = 120
+    u, flag = signal(3, n), np.arange(n) >= 60
+    y = lfilter([0.0, 0.2], [1.0, -0.8], u) + 0.5 * flag + 0.1 * rng.standard_normal(n)
+    record = dgp.Record(time=0.1 * np.arange(n), inputs=u, outputs=y)
+    step = Step(6.0)
+    model = with_channel(dgp.Wiener(1, pairs=1, inducing=4), step)
+    fit = dgp.fit(model, record, restarts=1, steps=60, draws=20, workers=1, progress=False)
+    found = parameters_of(fit, [step], record)
+    (weight,) = (pair for label, pair in found.items() if label.startswith("step"))
+    assert 0.003 < weight[1] < 0.5

@@ -19,12 +19,13 @@ class Quantity:
 
     Attributes:
         name: in words. unit: "time", that of the clock, or "channel", that of the channel.
-        low: its lower bound.
+        low: its lower bound. inside: whether it is a time within the record.
     """
 
     name: str
     unit: Literal["time", "channel"]
     low: float = -np.inf
+    inside: bool = False
 
 
 @dataclass(frozen=True)

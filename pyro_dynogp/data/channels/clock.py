@@ -26,7 +26,7 @@ class Step(Channel):
     """Zero before an instant, one from it on [time unit]: a shift of the output's level."""
 
     direct: ClassVar[bool] = True
-    numbers: ClassVar[Mapping[str, Quantity]] = {"at": Quantity("instant", "time")}
+    numbers: ClassVar[Mapping[str, Quantity]] = {"at": Quantity("instant", "time", inside=True)}
     at: float
 
     def _names(self) -> tuple[str, ...]:
