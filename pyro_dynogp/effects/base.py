@@ -151,6 +151,11 @@ def listed(evidence: Evidence | Sequence[Evidence]) -> Sequence[Evidence]:
     return [evidence] if isinstance(evidence, Evidence) else evidence
 
 
+def variants_of(extended: Model | None) -> list[Model]:
+    """The one variant that an extension gives; none where it gives none."""
+    return [] if extended is None else [extended]
+
+
 def number_of(evidence: Evidence, key: str) -> float:
     """A number that names the effect: a delay, a limit, a frequency."""
     return float(evidence.where[key])

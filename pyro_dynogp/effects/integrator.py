@@ -9,7 +9,7 @@ import numpy as np
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.signals import held
-from pyro_dynogp.effects.base import Effect, Parameters
+from pyro_dynogp.effects.base import Effect, Parameters, variants_of
 from pyro_dynogp.models.variants import Model, with_integrator
 from pyro_dynogp.statistics.detecting import lasting
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
@@ -65,8 +65,7 @@ class Integrator(Effect):
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
         """A pole at zero in the last dynamic layer; nothing where there is one."""
-        extended = with_integrator(model)
-        return [] if extended is None else [extended]
+        return variants_of(with_integrator(model))
 
     def parameters(self, fit: Fit, evidence: Evidence, record: Record) -> Parameters:
         """Rate of the output for one unit of each input [output / (input time)].

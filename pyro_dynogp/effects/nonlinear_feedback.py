@@ -10,7 +10,7 @@ import torch
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.signals import hermite, hinges
-from pyro_dynogp.effects.base import Effect, Parameters
+from pyro_dynogp.effects.base import Effect, Parameters, variants_of
 from pyro_dynogp.lti.views import steady_state_gain
 from pyro_dynogp.models.system import DynamicSystem
 from pyro_dynogp.models.variants import Model, with_output_feedback
@@ -88,8 +88,7 @@ class NonlinearFeedbackOfOutput(Effect):
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
         """A static layer that sees the output and acts on the last dynamic layer."""
-        extended = with_output_feedback(model)
-        return [] if extended is None else [extended]
+        return variants_of(with_output_feedback(model))
 
     def parameters(self, fit: Fit, evidence: Evidence, record: Record) -> Parameters:
         """Inverse steady-state gain at the low end, in the middle and at the high end.
@@ -138,9 +137,8 @@ class NonlinearFeedbackOfOutput(Effect):
         slopes = [pair for label, pair in parameters.items() if label.startswith("inverse steady")]
         if len(slopes) != len(NAMES):
             return ""
-        (low, _), (middle, _), (high, _) = slopes
         ends = [_sign(slopes[k], slopes[1]) for k in (0, 2)]
-        if not any(ends) or not all(np.isfinite(v) for v in (low, middle, high)):
+        if not any(ends):
             return ""
         if ends[0] == ends[1]:
             return "It hardens to both ends." if ends[0] > 0 else "It softens to both ends."

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.signals import hermite, hinges
-from pyro_dynogp.effects.base import Effect
+from pyro_dynogp.effects.base import Effect, variants_of
 from pyro_dynogp.models.variants import Model, with_output_function
 from pyro_dynogp.statistics.detecting import lasting
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
@@ -53,5 +53,4 @@ class OutputNonlinearity(Effect):
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
         """A static layer at that end; nothing where there is one."""
-        extended = with_output_function(model)
-        return [] if extended is None else [extended]
+        return variants_of(with_output_function(model))

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import stats
 
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.effects.base import Effect, Parameters, number_of
+from pyro_dynogp.effects.base import Effect, Parameters, number_of, variants_of
 from pyro_dynogp.models.variants import Model, with_output_function
 from pyro_dynogp.models.wiring import Static
 from pyro_dynogp.statistics.autoregression import fitted_filter
@@ -197,8 +197,7 @@ class Saturation(Effect):
         if model.outputs > 1 or model.direct:
             low = high = None
         limits = None if low is None and high is None else (low, high)
-        extended = with_output_function(model, limits)
-        return [] if extended is None else [extended]
+        return variants_of(with_output_function(model, limits))
 
     def parameters(self, fit: Fit, evidence: Evidence, record: Record) -> Parameters:
         """Limits of the sensor: its function where that is highest, or lowest.

@@ -128,7 +128,7 @@ def with_output_feedback(model: Model) -> Model | None:
     heavy = model.likelihood.degrees_of_freedom is not None
     if not isinstance(last, Dynamic) or model.has_feedback or varying or heavy:
         return None
-    looped = replace(last, feedback=(*last.feedback, FEEDBACK))
+    looped = replace(last, feedback=(FEEDBACK,))
     back = Static(outputs=model.outputs, inducing=INDUCING, name=FEEDBACK)
     output = model.output_wire.name
     return replace(

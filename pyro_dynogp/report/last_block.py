@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -54,9 +55,9 @@ def report_of(base: Fit, extended: Fit, course: SearchState, warnings: Sequence[
     elpd_gain, elpd_gain_error = float(gain.sum()), block_standard_error(gain)[0]
     harm: list[str] = []
     if accepted:
-        compared = before, after, elpd_gain, elpd_gain_error, rounds.settings
-        harm = harm_done(*compared)
-        warnings = [*disagreement(*compared), *warnings]
+        compared = Compared(before, after, elpd_gain, elpd_gain_error, rounds.settings)
+        harm = compared.harm
+        warnings = [*compared.disagreement, *warnings]
     watch.stop("scores of the last block")
     tests = _tested([f for f, _ in accepted], (base, extended), whole, sealed, rounds)
     watch.stop("residual tests of the last block")
@@ -88,69 +89,70 @@ def report_of(base: Fit, extended: Fit, course: SearchState, warnings: Sequence[
     )
 
 
-def harm_done(
-    before: Mapping[str, float],
-    after: Mapping[str, float],
-    gain: float,
-    error: float,
-    settings: LoopSettings,
-) -> list[str]:
-    """In words, that the extended model does worse on the last block; nothing where it does not.
+@dataclass(frozen=True)
+class Compared:
+    """Scores of the last block with and without what was added.
 
-    It does where the RMSE and the CRPS of its forecasts are more than `settings.worse` times those
-    before, or where it loses more log density than `settings.worse_errors` standard errors and does
-    not forecast better by both scores: densities one step ahead fall, too, where process noise has
-    gone that made up for what was missing.
-
-    Args:
+    Attributes:
         before, after: scores of the forecasts [output].
         gain, error: in log density, with its block standard error [nats].
+        settings: what counts as worse.
     """
-    worse = all(after[name] > settings.worse * before[name] for name in ("rmse", "crps"))
-    if not worse and not _less_likely(before, after, gain, error, settings):
-        return []
-    scores = ", ".join(
-        f"{name.upper()} {before[name]:.3g} -> {after[name]:.3g}" for name in ("rmse", "crps")
-    )
-    return [
-        f"What was added does harm on the last block ({scores}, elpd {gain:+.1f} +- {error:.1f} "
-        f"nats): what held-out data speak for need not last. Rely on the model before, which "
-        f"report.fit is; report.extended is the extended one. Look at its residuals there, and "
-        f"confirm what was named on another record before you use it."
-    ]
 
+    before: Mapping[str, float]
+    after: Mapping[str, float]
+    gain: float
+    error: float
+    settings: LoopSettings
 
-def _better(before: Mapping[str, float], after: Mapping[str, float]) -> bool:
-    """Whether forecasts are better by both scores."""
-    return all(after[name] < before[name] for name in ("rmse", "crps"))
+    def _all(self, ratio: Callable[[float, float], bool]) -> bool:
+        """Whether something holds of both scores, after and before."""
+        return all(ratio(self.after[name], self.before[name]) for name in ("rmse", "crps"))
 
+    @property
+    def better(self) -> bool:
+        """Whether forecasts are better by both scores."""
+        return self._all(lambda after, before: after < before)
 
-def _less_likely(
-    before: Mapping[str, float],
-    after: Mapping[str, float],
-    gain: float,
-    error: float,
-    settings: LoopSettings,
-) -> bool:
-    """Whether log density is lost for certain, and no better forecasts make up for it."""
-    return gain < -settings.worse_errors * error and not _better(before, after)
+    @property
+    def less_likely(self) -> bool:
+        """Whether log density is lost for certain."""
+        return self.gain < -self.settings.worse_errors * self.error
 
+    @property
+    def harm(self) -> list[str]:
+        """In words, that the extended model does worse on the last block; nothing where not.
 
-def disagreement(
-    before: Mapping[str, float],
-    after: Mapping[str, float],
-    gain: float,
-    error: float,
-    settings: LoopSettings,
-) -> list[str]:
-    """In words, that scores disagree: better forecasts, lower densities one step ahead."""
-    if gain >= -settings.worse_errors * error or not _better(before, after):
-        return []
-    return [
-        f"Scores of the last block disagree: forecasts are better with what was added, one step "
-        f"ahead the model before is more likely (elpd {gain:+.1f} +- {error:.1f} nats). Take the "
-        f"extended model (report.fit) for simulation and forecasts; one step ahead report.base."
-    ]
+        It does where the RMSE and the CRPS of its forecasts are more than `settings.worse` times
+        those before, or where it loses more log density than `settings.worse_errors` standard
+        errors and does not forecast better by both scores: densities one step ahead fall, too,
+        where process noise has gone that made up for what was missing.
+        """
+        worse = self._all(lambda after, before: after > self.settings.worse * before)
+        if not worse and not (self.less_likely and not self.better):
+            return []
+        scores = ", ".join(
+            f"{name.upper()} {self.before[name]:.3g} -> {self.after[name]:.3g}"
+            for name in ("rmse", "crps")
+        )
+        return [
+            f"What was added does harm on the last block ({scores}, elpd {self.gain:+.1f} +- "
+            f"{self.error:.1f} nats): what held-out data speak for need not last. Rely on the "
+            f"model before, which report.fit is; report.extended is the extended one. Look at its "
+            f"residuals there, and confirm what was named on another record before you use it."
+        ]
+
+    @property
+    def disagreement(self) -> list[str]:
+        """In words, that scores disagree: better forecasts, lower densities one step ahead."""
+        if not (self.less_likely and self.better):
+            return []
+        return [
+            f"Scores of the last block disagree: forecasts are better with what was added, one "
+            f"step ahead the model before is more likely (elpd {self.gain:+.1f} +- "
+            f"{self.error:.1f} nats). Take the extended model (report.fit) for simulation and "
+            f"forecasts; one step ahead report.base."
+        ]
 
 
 def _outcome(course: SearchState, harm: bool) -> str:

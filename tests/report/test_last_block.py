@@ -11,7 +11,7 @@ import pyro_dynogp as dgp
 from pyro_dynogp import LoopSettings, effects
 from pyro_dynogp.discrepancy.result import KEPT
 from pyro_dynogp.report import last_block
-from pyro_dynogp.report.last_block import _outcome, disagreement, harm_done
+from pyro_dynogp.report.last_block import Compared, _outcome
 from tests.discrepancy.test_loop import close, fitted, machine
 
 BEFORE = {"rmse": 1.0, "crps": 0.5}
@@ -34,7 +34,7 @@ BEFORE = {"rmse": 1.0, "crps": 0.5}
     ],
 )
 def test_harm_is_said(after: dict[str, float], gain: float, harm: bool) -> None:
-    found = harm_done(BEFORE, after, gain, 3.0, LoopSettings())
+    found = Compared(BEFORE, after, gain, 3.0, LoopSettings()).harm
     assert bool(found) is harm
     if harm:
         assert f"CRPS 0.5 -> {after['crps']:.3g}, elpd {gain:+.1f} +- 3.0 nats" in found[0]
@@ -50,13 +50,13 @@ def test_harm_is_said(after: dict[str, float], gain: float, harm: bool) -> None:
     ],
 )
 def test_scores_that_disagree_are_said(after: dict[str, float], gain: float, said: bool) -> None:
-    found = disagreement(BEFORE, after, gain, 3.0, LoopSettings())
+    found = Compared(BEFORE, after, gain, 3.0, LoopSettings()).disagreement
     assert bool(found) is said
     assert not said or "one step ahead report.base" in found[0]
 
 
 def test_two_models_that_are_the_same_do_no_harm() -> None:
-    assert harm_done(BEFORE, BEFORE, 0.0, 0.0, LoopSettings()) == []
+    assert Compared(BEFORE, BEFORE, 0.0, 0.0, LoopSettings()).harm == []
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_without_harm_the_extended_model_is_the_fit(monkeypatch: pytest.MonkeyPa
     assert report.outcome == "effects added"
     assert report.fit is report.extended is not report.base
     assert str(report).startswith("Effects added.\n")
-    monkeypatch.setattr(last_block, "harm_done", lambda *given: ["Harm."])
+    monkeypatch.setattr(last_block.Compared, "harm", ["Harm."])
     again = close(fitted(record), record)
     assert again.fit is again.base
     assert again.after == report.after  # the numbers stay as measured
