@@ -132,7 +132,7 @@ def _kept(trial: Trial, training: Record) -> Fit:
     """The variant that is kept, fitted to the training data."""
     if trial.fit is not None:
         return trial.fit
-    if len(trial.models) > 1 and trial.compared == "held out":
+    if len(trial.models) > 1 and trial.compared != "training":
         return _best_ahead(trial, training)
     (model, *others), start = trial.models, trial.base
     finer = _finer(trial, model, training, 0)
@@ -157,13 +157,15 @@ def _finer(trial: Trial, model: Model, training: Record, times: int) -> Sequence
 def _best_ahead(trial: Trial, training: Record) -> Fit:
     """The first variant that does as well as the best on the data held out.
 
-    Variants differ in how they extrapolate, and what is right in one stretch may be luck: only
-    those count whose forecasts are no worse than those of the base held at its last level, or else
-    the last one, which leaves most open.
+    Where they differ in how they extrapolate what is right in one stretch may be luck: of those
+    that are rehearsed only those count whose forecasts are no worse than those of the base held at
+    its last level, or else the last one, which leaves most open.
     """
     fits = [refit(trial.base, training, model=model, run=trial.run) for model in trial.models]
     fold, settings = trial.folds[0], trial.settings
-    kept = lasting(fits, trial.base, trial.record, fold, trial.run, settings) or fits[-1:]
+    kept = fits
+    if trial.compared == "rehearsed":
+        kept = lasting(fits, trial.base, trial.record, fold, trial.run, settings) or fits[-1:]
     sums = [held_out_density(f, trial.record, fold, trial.score).sum() for f in kept]
     least = max(sums) - settings.gain
     return next(f for f, total in zip(kept, sums, strict=True) if total >= least)

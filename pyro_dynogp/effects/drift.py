@@ -84,7 +84,7 @@ class Drift(Effect):
 
     name = "drift"
     family = "time"
-    compared = "held out"
+    compared = "rehearsed"
     experiments: ClassVar = {
         "level shift": "a longer record at rest",
         "process noise": "a longer record at constant inputs",

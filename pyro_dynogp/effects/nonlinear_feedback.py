@@ -10,10 +10,11 @@ import torch
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.signals import hermite, hinges
-from pyro_dynogp.effects.base import Effect, Parameters, variants_of
+from pyro_dynogp.effects.base import Effect, Parameters
 from pyro_dynogp.lti.views import steady_state_gain
 from pyro_dynogp.models.system import DynamicSystem
-from pyro_dynogp.models.variants import Model, with_output_feedback
+from pyro_dynogp.models.variants import FEEDBACK, HIDDEN_FEEDBACK, Model, with_feedback
+from pyro_dynogp.models.wiring import HIDDEN
 from pyro_dynogp.statistics.detecting import lasting
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
 from pyro_dynogp.statistics.pictures import about, against, evidence, labelled
@@ -38,28 +39,35 @@ def nonlinear_feedback(residuals: Residuals, settings: LoopSettings, *, seed: in
     the linear model is to first order what the poles of A make of h(y), with y as the model has it:
     columns are h(mean) through each pole (`filtered`), with shapes h as in the test for a function
     of the output: Hermite polynomials of the second and third degree, apart and together, and
-    piecewise linear functions with one knot. What the mean itself does through the poles is
-    nuisance. A sensor that is not linear sets this test off as well: refits tell the two apart.
-    `where` is empty.
+    piecewise linear functions with one knot; then the same of the mean's rate of change, which is
+    what friction acts on where a position is measured. What the mean itself does through the poles
+    is nuisance. A sensor that is not linear sets this test off as well: refits tell the two apart.
+    `where`: ``output``, its name.
 
     Source: first-order Volterra response of a feedback loop (Schetzen, The Volterra and Wiener
     Theories of Nonlinear Systems, 1980, chapter 8); shapes after Ramsey's RESET, J. R. Stat. Soc. B
     31:350, 1969.
     """
     r = residuals
-    powers, bends = hermite(r.mean), hinges(r.mean)
-    variants = [_driven(r, v) for v in (powers[:, :1], powers[:, 1:], powers, *bends.T[:, :, None])]
+    shapes = [*_shapes(r.mean), *_shapes(np.gradient(r.mean, r.time))]
+    variants = [_driven(r, shape) for shape in shapes]
     nuisance = _driven(r, r.mean[:, None])
     scan = lasting(r, variants, nuisance, settings, seed)
     label = labelled(f"simulated {r.output_name}", r.output_unit)
     return evidence(
         "nonlinear feedback",
         scan,
-        {},
+        {"output": r.output_name},
         f"A nonlinear function of '{r.output_name}' acts back on its dynamics, "
         f"{about(r, scan.size)}.",
         against(r, r.mean, label, nuisance, scan.fitted),
     )
+
+
+def _shapes(signal: np.ndarray) -> list[np.ndarray]:
+    """Functions of a signal (n,) that are no lines, each (n, c)."""
+    powers, bends = hermite(signal), hinges(signal)
+    return [powers[:, :1], powers[:, 1:], powers, *bends.T[:, :, None]]
 
 
 def _driven(r: Residuals, signals: np.ndarray) -> np.ndarray:
@@ -71,13 +79,18 @@ def _driven(r: Residuals, signals: np.ndarray) -> np.ndarray:
 
 
 class NonlinearFeedbackOfOutput(Effect):
-    """A function of the output that acts back on the dynamics: spring, friction, outflow."""
+    """A function that acts back on the dynamics: spring, friction, outflow.
+
+    Of the output, of a signal of the same states that nothing measures (a velocity, the level of
+    another tank), or one of each; the first of them that forecasts as well as the best is kept.
+    """
 
     name = "nonlinear feedback"
     family = "shapes"
     acts_on = "inputs"
     freedom = 5
     once = True
+    compared = "held out"
     experiments: ClassVar = {
         "output nonlinearity": "steps of several sizes: behind a sensor that is not linear the way "
         "to each level takes equally long, in feedback its time or its frequency changes with size",
@@ -87,8 +100,23 @@ class NonlinearFeedbackOfOutput(Effect):
     test = staticmethod(nonlinear_feedback)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
-        """A static layer that sees the output and acts on the last dynamic layer."""
-        return variants_of(with_output_feedback(model))
+        """Static layers that see the last dynamic layer and act back on it."""
+        kinds = ((True, False), (False, True), (True, True))
+        extended = [with_feedback(model, output=output, hidden=hidden) for output, hidden in kinds]
+        return [variant for variant in extended if variant is not None]
+
+    def sentence(self, evidence: Evidence, model: Model) -> str:
+        """Of which signals it is a function."""
+        functions = (FEEDBACK, HIDDEN_FEEDBACK)
+        signals = {name for w in model.wires if w.name in functions for name in w.sources}
+        hidden = {name for name in signals if name.endswith(HIDDEN)}
+        if not hidden:
+            return evidence.sentence
+        y = evidence.where["output"]
+        unseen = f"a signal of the dynamics of '{y}' that is not measured"
+        if hidden == signals:
+            return f"A nonlinear function of {unseen} acts back on them."
+        return f"Nonlinear functions of '{y}', and of {unseen}, act back on them."
 
     def parameters(self, fit: Fit, evidence: Evidence, record: Record) -> Parameters:
         """Inverse steady-state gain at the low end, in the middle and at the high end.
@@ -98,11 +126,11 @@ class NonlinearFeedbackOfOutput(Effect):
         its mean slope in each part of the output's range [input / output]; of the input with the
         largest gain. Standard deviations are those of the fit's draws: by default they know the
         function alone, as poles and gains stay at their optimum. None for several outputs, for
-        integrators, and without inputs.
+        integrators, without inputs, and where the output is a function of what acts back.
         """
         model, scaling = fit.model, fit.scaling
         fed = [wire for wire in model.wires if wire.feedback]
-        if model.outputs > 1 or len(fed) != 1 or len(fed[0].feedback) != 1:
+        if model.outputs > 1 or len(fed) != 1 or fed[0].feedback != (FEEDBACK,) or not fed[0].last:
             return {}
         system, (name,) = fit.system_at(fit.draws), fed[0].feedback
         dynamic, function = system.layer(fed[0].name), system.layer(name)

@@ -124,7 +124,7 @@ def steps_of(model: Model, plain: Potential) -> list[Step]:
     for one in model.wires:
         if isinstance(one.layer, Dynamic) and f"{one.name}_input_gain" in named:
             readers = [other for other in model.wires if one.name in other.sources]
-            if one.layer.outputs == 1 and len(readers) == 1:
+            if one.layer.width == 1 and len(readers) == 1:
                 found = _relative(one, readers[0], named, plain.at)
                 if found is not None:
                     sizes[readers[0].name] = found

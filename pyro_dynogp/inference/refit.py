@@ -200,7 +200,7 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
         fresh = linear_starts(target, records, None, run.seed) if more else []
         return climbed(target, [*fresh, *starts], LINEAR_STEPS)
     if len(target.layers) > len(fit.model.layers):
-        if not (run.steps or target.has_feedback):
+        if not (run.steps or (target.has_feedback and fit.model.is_linear)):
             starts += starting_points(target, records, run, count=FRESH, steps=FRESH_STEPS)
         return climb(target, records, starts, [], run, steps=run.steps or ADDED_STEPS,
                      optimizer=optimizer_for(target), effort=EXTENDED)  # fmt: skip

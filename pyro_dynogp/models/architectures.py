@@ -206,6 +206,7 @@ def NonlinearFeedback(
     *,
     outputs: int = 1,
     pairs: int = 1,
+    hidden: int = 0,
     inducing: int = 32,
     kernel: Kernel | None = None,
     process_noise: bool = True,
@@ -216,21 +217,29 @@ def NonlinearFeedback(
 
     A spring or friction that is not linear, a tank that empties through a valve:
     x' = A x + B u + F f(C x), y = C x + D u, with f held from sample to sample. Beyond the data f
-    keeps its value.
+    keeps its value. With hidden signals a second function f2 of h = H x comes back, too, and f is
+    named f1: friction where the position is measured, a tank above the one that is.
 
     Args: as those of `Wiener`; f sees all outputs and has as many, the output measured is g's.
+        hidden: number of signals that f2 sees and has as outputs.
 
     Example:
         >>> model = NonlinearFeedback(1, pairs=1)
         >>> [wire.name for wire in model.wires], model.output_wire.name
         (['g', 'f'], 'g')
     """
-    layers = (
-        Dynamic(outputs=outputs, pairs=pairs, process_noise=process_noise, feedback=("f",)),
+    verify(hidden=hidden)
+    back = ("f1", "f2") if hidden else ("f",)
+    layers: list[Layer] = [
+        Dynamic(
+            outputs=outputs, pairs=pairs, process_noise=process_noise, feedback=back, hidden=hidden
+        ),
         Static(outputs=outputs, inducing=inducing, kernel=kernel),
-    )
+    ]
+    if hidden:
+        layers.append(Static(outputs=hidden, inducing=inducing, kernel=kernel, sees=("g_hidden",)))
     looped: ModelOptions = {"integrate": "all", "output": "g", **options}
-    return Model(inputs, layers, likelihood or Gaussian(), **looped)
+    return Model(inputs, tuple(layers), likelihood or Gaussian(), **looped)
 
 
 def HammersteinWiener(

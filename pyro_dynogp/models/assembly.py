@@ -87,7 +87,7 @@ def places_of_outputs(wires: Sequence[Wire]) -> tuple[dict[str, int], int]:
         sources = [random[name] for name in place.sources]
         if isinstance(place.layer, Dynamic):
             total += place.channels if "trajectory" in sources else 0
-            random[place.name] = "trajectory"
+            random |= dict.fromkeys(place.signals, "trajectory")
         elif any(kind != "known" for kind in sources):
             first[place.name] = total
             total += place.layer.outputs
@@ -171,7 +171,7 @@ class _Assembler:
             self.extra = layer.function.variance(seen.known)
         return Signal(known, None, (KNOWN,) * place.layer.outputs)
 
-    def dynamic(self, place: Wire, layer: DynamicSystem) -> Signal:
+    def dynamic(self, place: Wire, layer: DynamicSystem) -> dict[str, Signal]:
         seen = self.sources(place)
         known = seen.known
         if TRAJECTORY in seen.outputs:  # a trajectory feeds the layer: hold it through an identity
@@ -201,7 +201,13 @@ class _Assembler:
         if seen.rows is not None:
             rows = rows + modes.D[..., : place.channels] @ seen.rows
         self.pairs_before += modes.pairs
-        return Signal(self.expand(response, 2), rows, (TRAJECTORY,) * modes.outputs)
+        response, first, found = self.expand(response, 2), 0, {}
+        for name, count in place.signals.items():
+            own = slice(first, first + count)
+            outputs = (TRAJECTORY,) * count
+            found[name] = Signal(response[..., own], rows[..., own, :], outputs)
+            first += count
+        return found
 
     def fed_back(self, place: Wire) -> list[int]:
         """Static outputs that come back to a dynamic layer."""
@@ -311,7 +317,7 @@ def assemble(
     walk = _Assembler(system, grid, inputs)
     for place, layer in zip(system.wires, system.layers, strict=True):
         if isinstance(layer, DynamicSystem):
-            walk.signals[place.name] = walk.dynamic(place, layer)
+            walk.signals |= walk.dynamic(place, layer)
         else:
             walk.signals[place.name] = walk.static(place, layer)
     return walk.finish(system.noise_sd(inputs, grid) if noise_sd is None else noise_sd)

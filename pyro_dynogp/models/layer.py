@@ -23,7 +23,7 @@ class Dynamic:
     """A stochastic LTI layer: its output is the trajectory of a linear system with process noise.
 
     Args:
-        outputs: width of the layer. pairs: P conjugate pairs (order 2P), shared by all outputs.
+        outputs: width of the layer. pairs: P conjugate pairs (order 2P), shared by all signals.
         noise: "shared" or "independent" Brownian motions, see `Modes`.
         brownian: number of Brownian motions; by default one for each output.
         feedthrough: whether the layer's input acts on its output at once.
@@ -36,6 +36,9 @@ class Dynamic:
         feedback: names of later static layers whose outputs are further inputs of this layer. Each
             acts from the sample after the one that it is computed at, and never on the output at
             once: the loop has a delay.
+        hidden: number of further signals of the same states, which nothing measures: a velocity
+            beside a position, a level in another tank. Functions see them by the name of the layer
+            and "_hidden", as in ``Static(sees=("g_hidden",))``; in models with feedback.
         name: prefix of its sites; g, or g1, g2, ... by default.
     """
 
@@ -49,12 +52,18 @@ class Dynamic:
     skip: tuple[str, ...] = ()
     sees: tuple[str, ...] = ()
     feedback: tuple[str, ...] = ()
+    hidden: int = 0
     name: str | None = None
+
+    @property
+    def width(self) -> int:
+        """Number of signals, outputs and hidden ones."""
+        return self.outputs + self.hidden
 
     @property
     def modes(self) -> int:
         """Number of poles that stand for pairs: an integrator counts, and its random walk."""
-        return self.pairs + self.integrators * self.outputs * (2 if self.process_noise else 1)
+        return self.pairs + self.integrators * self.width * (2 if self.process_noise else 1)
 
     @property
     def past_states(self) -> tuple[int, ...]:
@@ -62,7 +71,7 @@ class Dynamic:
 
         That of an integrator is real, and its random walk has no input.
         """
-        real = self.pairs + self.integrators * self.outputs
+        real = self.pairs + self.integrators * self.width
         return (*range(real), *range(self.modes, self.modes + self.pairs))
 
 

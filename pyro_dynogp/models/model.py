@@ -190,7 +190,7 @@ class Model(Structure):
             place.name,
             inputs=place.channels + place.fed,
             pairs=layer.pairs,
-            outputs=layer.outputs if layer.outputs > 1 else None,
+            outputs=layer.width if layer.width > 1 else None,
             brownian=layer.brownian or layer.outputs,
             noise=layer.noise,
             feedthrough=layer.feedthrough,

@@ -148,7 +148,9 @@ class Structure:
             if any(isinstance(w.layer, StaticLayer) for w in self.wires[place:])
             for name in reader.sources
         }
-        return tuple(w for w, _ in self.dynamic if w.channels + w.fed and w.name in names)
+        return tuple(
+            w for w, _ in self.dynamic if w.channels + w.fed and not names.isdisjoint(w.signals)
+        )
 
     @property
     def state_sites(self) -> tuple[Wire, ...]:

@@ -8,12 +8,21 @@ from dataclasses import replace
 from pyro_dynogp.data.channels import Channel, count_direct
 from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.wiring import Dynamic, Limits, Static, StaticLayer, Wire
+from pyro_dynogp.models.wiring import (
+    HIDDEN,
+    INPUTS,
+    Dynamic,
+    Layer,
+    Limits,
+    Static,
+    StaticLayer,
+    Wire,
+)
 
 # Inducing values of a function that is added.
 INDUCING = 32
-# Name of the function that acts back.
-FEEDBACK = "feedback"
+# Names of functions that act back: of a layer's output, and of a signal of it that is hidden.
+FEEDBACK, HIDDEN_FEEDBACK = "feedback", "hidden_feedback"
 
 
 def with_channel(model: Model, channel: Channel) -> Model:
@@ -117,22 +126,38 @@ def with_input_function(model: Model) -> Model | None:
     return replace(model, layers=(first, *model.layers), scaling=None, output=None)
 
 
-def with_output_feedback(model: Model) -> Model | None:
-    """The model with a static layer that sees its output and acts back on its last dynamic layer.
+def with_feedback(model: Model, *, output: bool = True, hidden: bool = False) -> Model | None:
+    """The model with static layers that see its last dynamic layer and act back on it.
 
-    None where there is feedback already, where another layer comes last, and under noise that
-    feedback does not allow.
+    Static layers may follow that layer: they are what measures it. None where there is feedback
+    already, without a dynamic layer, and under noise that feedback does not allow.
+
+    Args:
+        model: to extend. output: whether one function sees the output of the layer.
+        hidden: whether one sees a further signal of the same states, which nothing measures.
     """
-    *rest, last = model.layers
     varying = model.likelihood.varying and model.likelihood.of == "output"
     heavy = model.likelihood.degrees_of_freedom is not None
-    if not isinstance(last, Dynamic) or model.has_feedback or varying or heavy:
+    if not model.dynamic or model.has_feedback or varying or heavy:
         return None
-    looped = replace(last, feedback=(FEEDBACK,))
-    back = Static(outputs=model.outputs, inducing=INDUCING, name=FEEDBACK)
-    output = model.output_wire.name
+    seen, looped = model.dynamic[-1]
+    back = []
+    if output:
+        own = Static(outputs=looped.outputs, inducing=INDUCING, name=FEEDBACK, sees=(seen.name,))
+        back.append(own)
+    if hidden:
+        signal = (seen.name + HIDDEN,)
+        back.append(Static(inducing=INDUCING, name=HIDDEN_FEEDBACK, sees=signal))
+    names = tuple(str(layer.name) for layer in back)
+    layers: list[Layer] = []
+    for wire, layer in zip(model.wires, model.layers, strict=True):
+        sources = () if wire.sources == (INPUTS,) and not layers else wire.sources
+        layers.append(replace(layer, name=wire.name, sees=sources, skip=()))
+        if wire.name == seen.name:
+            looped = replace(looped, name=wire.name, sees=sources, skip=(), feedback=names)
+            layers[-1:] = [replace(looped, hidden=int(hidden)), *back]
     return replace(
-        model, layers=(*rest, looped, back), scaling=None, output=output, integrate="all"
+        model, layers=tuple(layers), scaling=None, output=model.output_wire.name, integrate="all"
     )
 
 

@@ -18,6 +18,8 @@ from pyro_dynogp.models.layer import in_double
 from pyro_dynogp.support.errors import COUNT, RULES, instance, invalid
 
 INPUTS = "inputs"
+# What follows a layer's name in that of its hidden signals.
+HIDDEN = "_hidden"
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,11 @@ class Wire:
     fed: int = 0
 
     @property
+    def signals(self) -> dict[str, int]:
+        """Names of the signals that the layer makes, and how many channels each has."""
+        return _signals(self.name, self.layer.outputs, _hidden(self.layer))
+
+    @property
     def feedback(self) -> tuple[str, ...]:
         """Names of the static layers whose outputs come back to this layer."""
         return self.layer.feedback if isinstance(self.layer, Dynamic) else ()
@@ -54,10 +61,11 @@ class Wire:
         the kind has with another length carry the layer's name.
         """
         own, first = f"{self.name}_input", self.sources == (INPUTS,)
+        hidden = _hidden(self.layer) > 0
         names = {
             "input": "input" if first and not self.fed else own,
             "direct": "input" if first else f"{self.name}_forward" if self.fed else own,
-            "output": "output" if self.last else f"{self.name}_output",
+            "output": "output" if self.last and not hidden else f"{self.name}_output",
         }
         for dim in ("pair", "brownian", "state", "inducing", "support"):
             names[dim] = dim if self.single else f"{self.name}_{dim}"
@@ -124,17 +132,23 @@ def wire(inputs: int, layers: Sequence[Layer], output: str | None = None) -> tup
         fed = sum(widths[source] for source in getattr(layer, "feedback", ()))
         single = sum(_letter(other) == _letter(layer) for other in layers) == 1
         wires.append(Wire(name, layer, sources, channels, False, last, single, fed))
-        width[name] = layer.outputs
+        width |= _signals(name, layer.outputs, _hidden(layer))
         before = name
     _check_that_all_matter(wires, output)
+    _check_hidden(wires)
     feeds = set(back)
     for place in range(len(wires) - 1, -1, -1):
         here = wires[place]
-        pathwise = here.name in feeds
+        pathwise = not feeds.isdisjoint(here.signals)
         wires[place] = replace(here, pathwise=pathwise)
         if isinstance(here.layer, Dynamic) or pathwise:
             feeds.update(here.sources)
     return tuple(wires)
+
+
+def _signals(name: str, outputs: int, hidden: int) -> dict[str, int]:
+    """Signals that a layer makes and their widths."""
+    return {name: outputs, name + HIDDEN: hidden} if hidden else {name: outputs}
 
 
 def _names(layers: Sequence[Layer]) -> list[str]:
@@ -151,6 +165,7 @@ def _names(layers: Sequence[Layer]) -> list[str]:
         number = "" if letters.count(letter) == 1 else str(letters[: place + 1].count(letter))
         names.append(layer.name or letter + number)
     reserved = {INPUTS, "y", "offset", "noise_sd", "log_noise"}
+    reserved |= {n + HIDDEN for n, layer in zip(names, layers, strict=True) if _hidden(layer)}
     if len(set(names)) < len(names) or set(names) & reserved:
         raise invalid(
             "layers",
@@ -179,6 +194,10 @@ def _letter(layer: Layer) -> str:
     return "g" if isinstance(layer, Dynamic) else "f"
 
 
+def _hidden(layer: Layer) -> int:
+    return layer.hidden if isinstance(layer, Dynamic) else 0
+
+
 def _check_feedback(names: Sequence[str], layers: Sequence[Layer]) -> None:
     for place, layer in enumerate(layers):
         for option in ("skip", "sees"):
@@ -204,7 +223,8 @@ def _check_that_all_matter(wires: Sequence[Wire], output: str) -> None:
     new = {output}
     while new:
         matter |= new
-        new = {s for w in wires if w.name in new for s in (*w.sources, *w.feedback)} - matter
+        seen = {s for w in wires if w.name in new for s in (*w.sources, *w.feedback)}
+        new = {w.name for w in wires if not seen.isdisjoint(w.signals)} - matter
     idle = [w.name for w in wires if w.name not in matter]
     if idle:
         raise invalid(
@@ -212,6 +232,18 @@ def _check_that_all_matter(wires: Sequence[Wire], output: str) -> None:
             expected=f"layers that lead to the output {output!r}, or back to one that does",
             got=f"{idle} without effect on it",
         )
+
+
+def _check_hidden(wires: Sequence[Wire]) -> None:
+    """Refuse hidden signals that no function sees, or without feedback: nothing depends on them."""
+    seen = {source for w in wires for source in w.sources}
+    for w in wires:
+        if _hidden(w.layer) and not (w.name + HIDDEN in seen and w.feedback):
+            raise invalid(
+                f"hidden of layer {w.name!r}",
+                expected=f"0, or a function that sees {w.name + HIDDEN!r} in a layer with feedback",
+                got=repr(_hidden(w.layer)),
+            )
 
 
 def _check_layer(name: str, layer: Layer) -> None:

@@ -15,7 +15,7 @@ from pyro_dynogp.effects.nonlinear_feedback import (
 )
 from pyro_dynogp.effects.output_nonlinearity import output_nonlinearity
 from pyro_dynogp.models.system import DynamicSystem
-from pyro_dynogp.models.variants import with_output_feedback
+from pyro_dynogp.models.variants import with_feedback
 from tests.discrepancy.made import SETTINGS, coloured, residuals_of
 
 STEP, DAMPING, STIFFNESS = 0.05, 0.6, 4.0
@@ -118,7 +118,7 @@ class TestBlock:
     )
     def test_elsewhere_there_is_no_such_block(self, model, spring):
         assert EFFECT.extend(model, None, spring) == []
-        assert with_output_feedback(model) is None
+        assert with_feedback(model) is None
 
 
 class TestNumbers:

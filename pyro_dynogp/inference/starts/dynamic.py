@@ -49,8 +49,15 @@ class DynamicStart:
     def _random(self, *shape: int, scale: float = SMALL) -> Tensor:
         return torch.tensor(scale * self.generator.standard_normal(shape), dtype=torch.float64)
 
-    def from_linear(self, linear: Mapping[str, Tensor], moved: bool = False) -> Values:
-        """The linear optimum's values under this layer's names; `moved`: its poles at random."""
+    def from_linear(
+        self, linear: Mapping[str, Tensor], moved: bool = False, ahead: bool = True
+    ) -> Values:
+        """The linear optimum's values under this layer's names.
+
+        Args:
+            linear: values. moved: whether its poles are moved at random.
+            ahead: of hidden signals, see `Plan`.
+        """
         values = {
             self.one.name + name[1:]: value for name, value in linear.items() if name[:2] == "g_"
         }
@@ -66,11 +73,13 @@ class DynamicStart:
             if self._key("integrator_gain") in values:
                 level = values[self._key("integrator_gain")]
                 values[self._key("integrator_gain")] = pad(level, (0, self.one.fed))
-        if layer.outputs > 1 and self._key("output_gain") not in values:
+        if layer.width > 1 and self._key("output_gain") not in values:
             # One signal is the linear fit; the others see the same modes with other gains.
             P = layer.pairs
-            gain = self._random(layer.outputs, P, 2, scale=0.7)
+            gain = self._random(layer.width, P, 2, scale=0.7)
             gain[0] = torch.tensor([1.0, 0.0], dtype=torch.float64)
+            if layer.hidden:
+                gain[-layer.hidden :] = self._hidden(values, ahead)
             values[self._key("output_gain")] = gain
             length = gain.square().sum((0, -1)).sqrt()  # directions have unit length
             values[self._key("input_gain")] = (
@@ -78,11 +87,11 @@ class DynamicStart:
             )
             if layer.feedthrough:
                 D = values[self._key("feedthrough")]
-                rest = self._random(layer.outputs - 1, D.shape[-1], scale=0.1)
+                rest = self._random(layer.width - 1, D.shape[-1], scale=0.1)
                 values[self._key("feedthrough")] = torch.cat([D.reshape(1, -1), rest])
             for site in map(self._key, INTEGRATORS):
                 if site in values:
-                    rest = self._random(layer.outputs - 1, *values[site].shape[1:])
+                    rest = self._random(layer.width - 1, *values[site].shape[1:])
                     values[site] = torch.cat([values[site], rest])
             if layer.process_noise:
                 values.update(self._small_noise())
@@ -92,6 +101,19 @@ class DynamicStart:
             noise = ("_noise_gain", "_integrator_noise")
             values = {k: v for k, v in values.items() if not any(part in k for part in noise)}
         return values
+
+    def _hidden(self, values: Values, ahead: bool) -> Tensor:
+        """Gains (P, 2) of the output's derivative by time, over the middle of the poles' sizes.
+
+        That is a velocity where a position is measured. `ahead`: with the output itself added, the
+        signal is that of a first-order lag before: a level in the tank above.
+        """
+        decay, frequency = (
+            values[self._key(name)].exp() for name in ("log_decay", "log_frequency")
+        )
+        pole = torch.stack([-decay, frequency], -1)
+        derivative = pole / pole.norm(dim=-1).median()
+        return derivative + torch.tensor([float(ahead), 0.0], dtype=torch.float64)
 
     def _fed_back(self, gain: Tensor) -> Tensor:
         """Gains (P, d + fed, 2): what comes back acts somewhat as the inputs do, sign at random."""
@@ -106,7 +128,7 @@ class DynamicStart:
     def near_identity(self) -> Values:
         """Each output is an input, beside small random dynamics."""
         layer, d = self.layer, self.one.channels
-        P, several = layer.pairs, layer.outputs > 1
+        P, several = layer.pairs, layer.width > 1
         rate = TimeScale.of(self.scaling).typical_rate
         poles = random_poles(P, self.scaling, self.generator)
         values = {
@@ -117,14 +139,14 @@ class DynamicStart:
             values[self._key("input_gain")] = self._random(P, d + self.one.fed, 2)
         if d:
             if layer.feedthrough:
-                D = torch.eye(layer.outputs, d, dtype=torch.float64)
-                D = D + self._random(layer.outputs, d)
+                D = torch.eye(layer.width, d, dtype=torch.float64)
+                D = D + self._random(layer.width, d)
                 values[self._key("feedthrough")] = D if several else D[0]
             else:  # the fastest pair passes the first input on
                 fastest = int(np.argmax(np.abs(poles)))
                 values[self._key("input_gain")][fastest, 0, 1] = 1.0
         if several:
-            gain = self._random(layer.outputs, P, 2, scale=0.7)
+            gain = self._random(layer.width, P, 2, scale=0.7)
             gain[0] = gain[0] + torch.tensor([1.0, 0.0], dtype=torch.float64)
             values[self._key("output_gain")] = gain
         if layer.process_noise:
@@ -134,7 +156,7 @@ class DynamicStart:
     def _small_noise(self) -> Values:
         layer = self.layer
         count = layer.brownian or layer.outputs
-        walk = {self._key("integrator_noise"): torch.full((layer.outputs, count), WALKS).double()}
+        walk = {self._key("integrator_noise"): torch.full((layer.width, count), WALKS).double()}
         return {
             **(walk if layer.integrators else {}),
             self._key("noise_gain_local_scale"): torch.full((layer.pairs,), 0.5).double(),

@@ -64,12 +64,15 @@ def extended_starts(
         own = {_renamed(site, {name: "g"}): value for site, value in learnt.items()}
         linear = grown(own, fresh, twin.all_sites(training[0].scaling, len(training)))
     topped = isinstance(model.layers[-1], Static) and isinstance(base.model.layers[-1], Dynamic)
+    hidden = any(layer.hidden for _, layer in model.dynamic)
     plans = [Plan(name, fresh, False, seed), Plan(name, linear, False, seed)]
-    if topped:
+    if hidden:
+        plans.append(Plan(name, linear, False, seed, ahead=False))
+    elif topped and not model.has_feedback:
         plans.append(Plan(name, linear, True, seed))
     with seeded(seed):  # what has no typical value is drawn
         new, *starts = [starting_point(model, records, plan) for plan in plans]
-    if topped and leading is not None:  # scaled to unit size, for the function above
+    if (topped or hidden) and leading is not None:  # scaled as the other signals ask for
         learnt = {k: v for k, v in learnt.items() if not k.startswith(f"{leading.name}_")}
     return [grown(learnt, start, sites) for start in starts], new
 
@@ -92,8 +95,12 @@ def _given_poles(
 def _places(base: Model, model: Model) -> dict[str, str]:
     """Names of layers in an extended model by their names in the model that it extends.
 
-    A layer more is the first one where that is a function and was none before, else the last.
+    They are the same where it has them all. Else the layer more is the first one where that is a
+    function and was none before, else the last.
     """
+    names = {wire.name for wire in base.wires}
+    if names <= {wire.name for wire in model.wires}:
+        return {name: name for name in names}
     first = isinstance(model.layers[0], Static) and not isinstance(base.layers[0], Static)
     skipped = len(model.layers) - len(base.layers) if first else 0
     pairs = zip(base.wires, model.wires[skipped:], strict=False)

@@ -78,12 +78,15 @@ class Plan:
         curved: whether a last static layer starts as the mean of the output given its input;
             else, as other static layers do, as a straight line.
         seed: of everything random.
+        ahead: whether hidden signals of the leading layer start as what a first-order lag before
+            the output sees; else as the output's derivative.
     """
 
     leading: str | None
     linear: Mapping[str, Tensor] | None
     curved: bool
     seed: int
+    ahead: bool = True
 
 
 def plans(
@@ -113,7 +116,7 @@ def plans(
         else:
             linear = found[used[name] % len(found)]
             used[name] += 1
-        out.append(Plan(name, linear, curved, s))
+        out.append(Plan(name, linear, curved, s, ahead=turn % 2 == 0))
     return out
 
 
@@ -147,7 +150,7 @@ def starting_point(model: Model, records: Sequence[PreparedRecord], plan: Plan) 
         if isinstance(one.layer, Dynamic):
             start = DynamicStart(model, one, one.layer, scaling, generator)
             if one.name == plan.leading and plan.linear is not None:
-                values.update(start.from_linear(plan.linear))
+                values.update(start.from_linear(plan.linear, ahead=plan.ahead))
             elif plan.linear is not None and _beside(model, one, plan.leading):
                 values.update(start.from_linear(plan.linear, moved=True))
             else:
@@ -177,7 +180,8 @@ def starting_point(model: Model, records: Sequence[PreparedRecord], plan: Plan) 
             fed = one.name in back
             outputs = start_static(model, one, one.layer, values, seen, line, curve, reach, fed)
         for signal, out in zip(signals, outputs, strict=True):
-            signal[one.name] = out
+            parts = out.split(list(one.signals.values()), -1)
+            signal |= dict(zip(one.signals, parts, strict=True))
     last = model.output_wire.name
     if model.measured_signal is not None:
         values["offset"] = level
@@ -226,10 +230,11 @@ def _linear_state(
     """Standard normal numbers of the first state that the linear fit finds by smoothing."""
     layer = one.layer
     assert isinstance(layer, Dynamic)
-    if layer.outputs != model.outputs or not one.channels:
+    other = layer.hidden and layer.integrators  # states that the linear fit has not
+    if layer.outputs != model.outputs or not one.channels or other:
         return torch.zeros(len(layer.past_states), dtype=torch.float64)
     noisy = "g_noise_gain_unit" in linear
-    alone = (replace(layer, feedback=(), process_noise=noisy),)
+    alone = (replace(layer, feedback=(), hidden=0, process_noise=noisy),)
     twin = Model(
         model.inputs, alone, direct=model.direct, initial_state="integrated", scaling=record.scaling
     )
