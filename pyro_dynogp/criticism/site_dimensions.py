@@ -53,9 +53,12 @@ def labels_of(model: Model, scaling: Scaling, records: Sequence[Record]) -> dict
             labels[f"{dim}_unit"] = (dim, np.array(units), {})
     signals = {INPUTS: scaling.input_names}
     for wire in model.wires:
-        width = wire.layer.outputs
-        several = tuple(f"{wire.name}[{a}]" for a in range(width))
-        signals[wire.name] = several if width > 1 else (wire.name,)
+        for name, width in wire.signals.items():
+            several = tuple(f"{name}[{a}]" for a in range(width))
+            signals[name] = several if width > 1 else (name,)
+        if len(wire.signals) > 1:
+            dim, own = wire.dims["output"], [signals[name] for name in wire.signals]
+            labels[dim] = (dim, np.array([label for names in own for label in names]), {})
     for wire in model.wires:
         seen = tuple(label for source in wire.sources for label in signals[source])
         fed = tuple(label for source in wire.feedback for label in signals[source])

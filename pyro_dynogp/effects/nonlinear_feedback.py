@@ -13,7 +13,7 @@ from pyro_dynogp.data.signals import hermite, hinges
 from pyro_dynogp.effects.base import Effect, Parameters
 from pyro_dynogp.lti.views import steady_state_gain
 from pyro_dynogp.models.system import DynamicSystem
-from pyro_dynogp.models.variants import FEEDBACK, HIDDEN_FEEDBACK, Model, with_feedback
+from pyro_dynogp.models.variants import FEEDBACK, Model, with_feedback
 from pyro_dynogp.models.wiring import HIDDEN
 from pyro_dynogp.statistics.detecting import lasting
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
@@ -89,7 +89,6 @@ class NonlinearFeedbackOfOutput(Effect):
     family = "shapes"
     acts_on = "inputs"
     freedom = 5
-    once = True
     compared = "held out"
     experiments: ClassVar = {
         "output nonlinearity": "steps of several sizes: behind a sensor that is not linear the way "
@@ -103,12 +102,13 @@ class NonlinearFeedbackOfOutput(Effect):
         """Static layers that see the last dynamic layer and act back on it."""
         kinds = ((True, False), (False, True), (True, True))
         extended = [with_feedback(model, output=output, hidden=hidden) for output, hidden in kinds]
-        return [variant for variant in extended if variant is not None]
+        return list({repr(variant): variant for variant in extended if variant}.values())
 
     def sentence(self, evidence: Evidence, model: Model) -> str:
         """Of which signals it is a function."""
-        functions = (FEEDBACK, HIDDEN_FEEDBACK)
-        signals = {name for w in model.wires if w.name in functions for name in w.sources}
+        sources = {wire.name: wire.sources for wire in model.wires}
+        back = [name for wire in model.wires for name in wire.feedback]
+        signals = {signal for name in back for signal in sources[name]}
         hidden = {name for name in signals if name.endswith(HIDDEN)}
         if not hidden:
             return evidence.sentence

@@ -17,6 +17,7 @@ from pyro_dynogp.models.assembly import Assembly, assemble
 from pyro_dynogp.models.draws import JointState
 from pyro_dynogp.models.output_process import LayerMoments, OutputProcess
 from pyro_dynogp.models.system import System
+from pyro_dynogp.models.wiring import INPUTS
 from pyro_dynogp.moments import filtering, smoothing
 from pyro_dynogp.moments.layout import Layout, Values
 from pyro_dynogp.moments.problem import FilterProblem, each, log_density
@@ -158,15 +159,16 @@ class MomentOutputs(OutputProcess):
         mean = np.stack([m for m, _ in found])
         sd = np.sqrt(np.stack([v for _, v in found]))
         out, start = {}, 0
-        for wire in self.system.wires:
-            signal = self.assembly.signals[wire.name]
+        for name, signal in self.assembly.signals.items():
+            if name == INPUTS:
+                continue
             n, w = signal.known.shape[-2:]
             known = signal.known.expand(*batch, n, w).reshape(-1, n, w).numpy()
             if signal.rows is None:
-                out[wire.name] = LayerMoments(known, np.zeros_like(known))
+                out[name] = LayerMoments(known, np.zeros_like(known))
                 continue
             own = slice(start, start + w)
-            out[wire.name] = LayerMoments(known + mean[..., own], sd[..., own])
+            out[name] = LayerMoments(known + mean[..., own], sd[..., own])
             start += w
         return out
 

@@ -129,8 +129,8 @@ def with_input_function(model: Model) -> Model | None:
 def with_feedback(model: Model, *, output: bool = True, hidden: bool = False) -> Model | None:
     """The model with static layers that see its last dynamic layer and act back on it.
 
-    Static layers may follow that layer: they are what measures it. None where there is feedback
-    already, without a dynamic layer, and under noise that feedback does not allow.
+    Static layers may follow that layer: they are what measures it. None where there is nothing to
+    add, with feedback to another layer, and under noise that feedback does not allow.
 
     Args:
         model: to extend. output: whether one function sees the output of the layer.
@@ -138,24 +138,28 @@ def with_feedback(model: Model, *, output: bool = True, hidden: bool = False) ->
     """
     varying = model.likelihood.varying and model.likelihood.of == "output"
     heavy = model.likelihood.degrees_of_freedom is not None
-    if not model.dynamic or model.has_feedback or varying or heavy:
+    if not model.dynamic or varying or heavy:
         return None
-    seen, looped = model.dynamic[-1]
+    seen, layer = model.dynamic[-1]
+    sources = {wire.name: wire.sources for wire in model.wires}
+    before = {sources[name] for name in layer.feedback}
+    own, unseen = (seen.name,), (seen.name + HIDDEN,)
     back = []
-    if output:
-        own = Static(outputs=looped.outputs, inducing=INDUCING, name=FEEDBACK, sees=(seen.name,))
-        back.append(own)
-    if hidden:
-        signal = (seen.name + HIDDEN,)
-        back.append(Static(inducing=INDUCING, name=HIDDEN_FEEDBACK, sees=signal))
-    names = tuple(str(layer.name) for layer in back)
+    if output and own not in before:
+        back.append(Static(outputs=layer.outputs, inducing=INDUCING, name=FEEDBACK, sees=own))
+    if hidden and unseen not in before:
+        back.append(Static(inducing=INDUCING, name=HIDDEN_FEEDBACK, sees=unseen))
+    if not back or (model.has_feedback and not layer.feedback):
+        return None
+    names = (*layer.feedback, *(str(one.name) for one in back))
+    width = max(layer.hidden, int(hidden))
     layers: list[Layer] = []
-    for wire, layer in zip(model.wires, model.layers, strict=True):
-        sources = () if wire.sources == (INPUTS,) and not layers else wire.sources
-        layers.append(replace(layer, name=wire.name, sees=sources, skip=()))
-        if wire.name == seen.name:
-            looped = replace(looped, name=wire.name, sees=sources, skip=(), feedback=names)
-            layers[-1:] = [replace(looped, hidden=int(hidden)), *back]
+    for wire, other in zip(model.wires, model.layers, strict=True):
+        sees = () if wire.sources == (INPUTS,) and not layers else wire.sources
+        if isinstance(other, Dynamic) and wire.name == seen.name:
+            other = replace(other, feedback=names, hidden=width)
+        layers.append(replace(other, name=wire.name, sees=sees, skip=()))
+        layers += back if wire.name == seen.name else []
     return replace(
         model, layers=tuple(layers), scaling=None, output=model.output_wire.name, integrate="all"
     )

@@ -21,6 +21,7 @@ from tests.discrepancy.made import SETTINGS, coloured, residuals_of
 STEP, DAMPING, STIFFNESS = 0.05, 0.6, 4.0
 POLE = complex(-0.5 * DAMPING, np.sqrt(STIFFNESS - 0.25 * DAMPING**2))
 EFFECT = NonlinearFeedbackOfOutput()
+SAID = SimpleNamespace(sentence="What the test said.", where={"output": "x"})
 
 
 def sprung(u, cubic):
@@ -63,7 +64,7 @@ class TestDetection:
         r = self.seen(0, 1.0)
         found = nonlinear_feedback(r, SETTINGS)
         assert found.p_value < 1e-4
-        assert found.where == {}
+        assert found.where == {"output": "y"}
         assert "acts back on its dynamics" in found.sentence
         # To first order the poles make the residual; a function at once explains less.
         assert found.gain > output_nonlinearity(r, SETTINGS).gain + 10.0
@@ -94,27 +95,68 @@ class TestDetection:
 
 
 class TestBlock:
-    def test_a_function_sees_the_output_and_comes_back(self, spring):
-        (model,) = EFFECT.extend(dgp.LinearDynamicGP(1, pairs=2), None, spring)
-        looped = {wire.name: wire.feedback for wire in model.wires}
-        assert looped == {"g": ("feedback",), "feedback": ()}
-        assert model.output_wire.name == "g"
-        assert model.dynamic[0][1].pairs == 2
+    def test_functions_see_the_output_a_hidden_signal_or_both_and_come_back(self, spring):
+        variants = EFFECT.extend(dgp.LinearDynamicGP(1, pairs=2), None, spring)
+        wired = [{w.name: (w.sources, w.feedback) for w in model.wires} for model in variants]
+        output, hidden = (("g",), ()), (("g_hidden",), ())
+        assert wired == [
+            {"g": (("inputs",), ("feedback",)), "feedback": output},
+            {"g": (("inputs",), ("hidden_feedback",)), "hidden_feedback": hidden},
+            {"g": (("inputs",), ("feedback", "hidden_feedback")), "feedback": output,
+             "hidden_feedback": hidden},
+        ]  # fmt: skip
+        for model in variants:
+            assert model.output_wire.name == "g"
+            assert model.dynamic[0][1].pairs == 2
+        said = [EFFECT.sentence(SAID, model) for model in variants]
+        assert said == [
+            "What the test said.",
+            "A nonlinear function of a signal of the dynamics of 'x' that is not measured acts "
+            "back on them.",
+            "Nonlinear functions of 'x', and of a signal of the dynamics of 'x' that is not "
+            "measured, act back on them.",
+        ]
+
+    def test_what_is_there_is_not_added_again(self, spring):
+        """To a function of the output one of a hidden signal, and the other way round."""
+        first, second, both = EFFECT.extend(dgp.LinearDynamicGP(1), None, spring)
+        for model in (first, second):
+            (more,) = EFFECT.extend(model, None, spring)
+            assert set(more.dynamic[0][0].feedback) == {"feedback", "hidden_feedback"}
+            assert more.dynamic[0][1].hidden == 1
+        assert EFFECT.extend(both, None, spring) == []
+        (own,) = EFFECT.extend(dgp.NonlinearFeedback(1), None, spring)
+        assert own.dynamic[0][0].feedback == ("f", "hidden_feedback")
+        assert EFFECT.extend(dgp.NonlinearFeedback(1, hidden=2), None, spring) == []
 
     def test_a_function_before_the_dynamics_stays(self, spring):
-        (model,) = EFFECT.extend(dgp.Hammerstein(1), None, spring)
-        assert [wire.name for wire in model.wires if wire.feedback] == [model.output_wire.name]
-        assert len(model.layers) == 3
+        for model in EFFECT.extend(dgp.Hammerstein(1), None, spring):
+            assert [wire.name for wire in model.wires if wire.feedback] == ["g"]
+            assert model.wires[0].name == "f"
+            assert model.output_wire.name == "g"
+
+    def test_a_sensor_stays_behind_the_loop(self, spring):
+        for model in EFFECT.extend(dgp.Wiener(1), None, spring):
+            wires = {wire.name: wire for wire in model.wires}
+            assert wires["g"].feedback
+            assert model.output_wire.name == "f"
+            assert wires["f"].sources == ("g",)
 
     @pytest.mark.parametrize(
         "model",
         [
-            dgp.Wiener(1),
-            dgp.NonlinearFeedback(1),
+            dgp.Cascade(
+                1,
+                (
+                    dgp.Dynamic(feedback=("f",), name="g1"),
+                    dgp.Static(name="f"),
+                    dgp.Dynamic(name="g2", sees=("g1",)),
+                ),
+            ),
             dgp.LinearDynamicGP(1, likelihood=dgp.StudentT(4)),
             dgp.LinearDynamicGP(1, likelihood=dgp.Heteroscedastic(of="output")),
         ],
-        ids=["function of the output", "feedback", "heavy tails", "noise of the output"],
+        ids=["feedback of another layer", "heavy tails", "noise of the output"],
     )
     def test_elsewhere_there_is_no_such_block(self, model, spring):
         assert EFFECT.extend(model, None, spring) == []

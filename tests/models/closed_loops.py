@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,12 +13,19 @@ from pyro_dynogp.layers.sites import sample
 from pyro_dynogp.models.wiring import Dynamic, Static
 
 
-def spring(outputs=1, pairs=2, inputs=1, process_noise=True, **options):
-    """A layer g whose output comes back through a function f of all of it."""
-    layers = (
-        Dynamic(outputs=outputs, pairs=pairs, process_noise=process_noise, feedback=("f",)),
-        Static(outputs=outputs, inducing=6, mean="linear"),
+def spring(outputs=1, pairs=2, inputs=1, process_noise=True, hidden=0, both=True, **options):
+    """A layer g whose output comes back through a function f of all of it.
+
+    With hidden signals through a function h of them, too; or, unless `both`, through f of them.
+    """
+    back = ("f", "h") if hidden and both else ("f",)
+    dynamic = Dynamic(
+        outputs=outputs, pairs=pairs, process_noise=process_noise, feedback=back, hidden=hidden
     )
+    layers = [dynamic, Static(outputs=outputs, inducing=6, mean="linear", name="f")]
+    unseen = Static(outputs=hidden or 1, inducing=6, mean="linear", sees=("g_hidden",))
+    if hidden:
+        layers[1 + both :] = [replace(unseen, name=back[-1])]
     return dgp.Cascade(inputs, layers, output="g", **options)
 
 
@@ -40,12 +48,13 @@ def values_of(model, record, seed=0, linear=True):
     values["noise_sd"] = values["noise_sd"].clamp(0.05, 1.0)
     values["g_input_gain"] = 0.4 * torch.tanh(values["g_input_gain"])
     if linear:
-        if "f_slope" in values:  # of several signals, whose loops explode where it is steep
-            values["f_slope"] = 0.3 * torch.tanh(values["f_slope"])
-        values["f_values"] = torch.zeros_like(values["f_values"])
-        if "f_half_width" in values:  # a line as far as any run goes
-            values["f_half_width"] = torch.full_like(values["f_half_width"], 60.0)
-        values["f_output_scale"] = 1e-13 + torch.zeros_like(values["f_output_scale"])
+        for f in model.dynamic[0][0].feedback:
+            if f"{f}_slope" in values:  # of several signals, whose loops explode where it is steep
+                values[f"{f}_slope"] = 0.3 * torch.tanh(values[f"{f}_slope"])
+            values[f"{f}_values"] = torch.zeros_like(values[f"{f}_values"])
+            if f"{f}_half_width" in values:  # a line as far as any run goes
+                values[f"{f}_half_width"] = torch.full_like(values[f"{f}_half_width"], 60.0)
+            values[f"{f}_output_scale"] = 1e-13 + torch.zeros_like(values[f"{f}_output_scale"])
     return values
 
 
@@ -69,17 +78,29 @@ class ClosedLoop:
     """
 
     def __init__(self, model, system, record):
-        layer, function = system.layer("g"), system.layer("f").function
+        layer = system.layer("g")
         modes, scaling = layer.modes, model.scaling
         P = modes.pairs
         lam = np.concatenate([modes.poles.numpy(), modes.poles.numpy().conj()])
         B = np.concatenate([modes.B.numpy(), modes.B.numpy().conj()])
-        self.H = np.concatenate([modes.C.numpy(), modes.C.numpy().conj()], -1)
-        d = model.inputs
+        self.signals = np.concatenate([modes.C.numpy(), modes.C.numpy().conj()], -1)
+        d, n_y = model.inputs, model.outputs
+        self.H = self.signals[:n_y]
         u = (record.inputs - scaling.input_offset) / scaling.input_scale
-        slope, constant = function.slope.numpy(), function.constant.numpy()
+        wires = {w.name: w for w in model.wires}
+        slopes, constants = [], []
+        for name in wires["g"].feedback:  # each function's slope by all signals of the layer
+            f = system.layer(name).function
+            own, count = f.slope.numpy(), len(f.constant)
+            row = [
+                own if signal in wires[name].sources else np.zeros((count, width))
+                for signal, width in wires["g"].signals.items()
+            ]
+            slopes.append(np.concatenate(row, 1))
+            constants.append(f.constant.numpy())
+        slope, constant = np.concatenate(slopes), np.concatenate(constants)
         D = modes.D.numpy()[:, :d]
-        self.level = u @ D.T + system.offset.numpy()
+        self.level = u @ D[:n_y].T + system.offset.numpy()
         self.F, self.drive, self.Q, self.back = [], [], [], []
         L = np.zeros((2 * P, 1))
         if modes.has_process_noise:
@@ -88,7 +109,7 @@ class ClosedLoop:
         sigma = -(L @ L.conj().T) / rates
         for k, step in enumerate(np.diff(record.time)):
             gain = (np.expm1(lam * step) / lam)[:, None] * B
-            self.F.append(np.diag(np.exp(lam * step)) + gain[:, d:] @ slope @ self.H)
+            self.F.append(np.diag(np.exp(lam * step)) + gain[:, d:] @ slope @ self.signals)
             seen = slope @ (u[k] @ D.T) + constant  # f sees the layer's output, u acts at once
             self.drive.append(gain[:, :d] @ u[k] + gain[:, d:] @ seen)
             self.back.append(gain[:, d:])
@@ -120,8 +141,8 @@ class ClosedLoop:
             m, P = m + K @ e, P - K @ H @ P
         return total, np.array(means), np.array(covariances)
 
-    def simulate(self, functions, rng):
-        """Scaled outputs (S, n, n_y) of runs, each with a function of its own beside the line.
+    def simulate(self, functions, rng, seen=0):
+        """Scaled outputs (S, n, n_y) of runs, each with a function of its own of signal `seen`.
 
         Process and measurement noise act; the output is one, and no input acts on it at once.
         """
@@ -141,7 +162,7 @@ class ClosedLoop:
             e = rng.standard_normal((count, 1)) * np.sqrt(self.noise)
             out.append(g + self.level[k] + e)
             if k < len(self.F):
-                back = functions(g[:, 0])[:, None] * self.back[k][:, 0]
+                back = functions((x @ self.signals[seen]).real)[:, None] * self.back[k][:, 0]
                 x = x @ self.F[k].T + self.drive[k] + back + noise(self.Q[k])
         return np.stack(out, 1)
 

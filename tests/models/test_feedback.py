@@ -11,7 +11,9 @@ from pyro_dynogp.models.feedback_draws import draw_outputs
 from pyro_dynogp.models.outputs import output_process
 from tests.models.closed_loops import ClosedLoop, make_record, spring, system_at, values_of
 
-CASES = [(1, 1, False), (1, 1, True), (2, 1, False), (2, 2, True)]
+CASES = [(1, 1, False, {}), (1, 1, True, {}), (2, 1, False, {}), (2, 2, True, {}),
+         (1, 1, False, {"hidden": 1}), (1, 2, True, {"hidden": 1, "both": False}),
+         (2, 1, True, {"hidden": 2})]  # fmt: skip
 
 
 def line_case(outputs, inputs, irregular, **options):
@@ -23,10 +25,10 @@ def line_case(outputs, inputs, irregular, **options):
     return record, ClosedLoop(model, system, record), output_process(system, prepared)
 
 
-@pytest.mark.parametrize(("outputs", "inputs", "irregular"), CASES)
-def test_a_line_in_feedback_is_a_linear_system(outputs, inputs, irregular):
+@pytest.mark.parametrize(("outputs", "inputs", "irregular", "more"), CASES)
+def test_a_line_in_feedback_is_a_linear_system(outputs, inputs, irregular, more):
     """Log density, and one step ahead mean and variance."""
-    record, loop, process = line_case(outputs, inputs, irregular)
+    record, loop, process = line_case(outputs, inputs, irregular, **more)
     y = record.tensors().observations
     total, means, covariances = loop.filter(loop.scaled(record.outputs))
     jacobian = (~np.isnan(record.outputs) * np.log(loop.scale)).sum()
@@ -37,10 +39,11 @@ def test_a_line_in_feedback_is_a_linear_system(outputs, inputs, irregular):
     np.testing.assert_allclose(found.variance, variance, rtol=1e-8, atol=1e-12)
 
 
+@pytest.mark.parametrize("hidden", [0, 1])
 @pytest.mark.parametrize("process_noise", [True, False])
-def test_every_site_changes_the_likelihood(process_noise):
+def test_every_site_changes_the_likelihood(process_noise, hidden):
     record = make_record()
-    model = spring(process_noise=process_noise).scaled_to(record)
+    model = spring(process_noise=process_noise, hidden=hidden).scaled_to(record)
     (prepared,) = model.prepare(record)
     values = values_of(model, record, linear=False)
 
@@ -55,9 +58,11 @@ def test_every_site_changes_the_likelihood(process_noise):
         assert abs(likelihood({**values, name: value + change}) - before) > 1e-6, name
 
 
-@pytest.mark.parametrize(("outputs", "inputs", "irregular"), CASES)
-def test_free_runs_of_a_line_in_feedback_are_those_of_the_linear_system(outputs, inputs, irregular):
-    _, loop, process = line_case(outputs, inputs, irregular, process_noise=False)
+@pytest.mark.parametrize(("outputs", "inputs", "irregular", "more"), CASES)
+def test_free_runs_of_a_line_in_feedback_are_those_of_the_linear_system(
+    outputs, inputs, irregular, more
+):
+    _, loop, process = line_case(outputs, inputs, irregular, process_noise=False, **more)
     _, means, _ = loop.filter()
     found = process.components(samples=3, seed=0)
     for mean in found.mean:
@@ -80,10 +85,11 @@ def test_process_noise_of_free_runs_is_that_of_the_linear_system(outputs, irregu
     assert (np.abs(ratio[variance > 1e-12] - 1.0) < 5.0 * np.sqrt(2.0 / count)).all()
 
 
-def test_runs_with_drawn_functions_are_those_of_a_plain_simulation():
+@pytest.mark.parametrize("seen", [0, 1], ids=["output", "hidden signal"])
+def test_runs_with_drawn_functions_are_those_of_a_plain_simulation(seen):
     """Functions from their dense conditional, states step by step in numpy; KS at ten times."""
     count = 300
-    model = spring()
+    model = spring(hidden=seen, both=False)
     record = make_record(irregular=True, missing=False)
     model = model.scaled_to(record)
     values = values_of(model, record, seed=5, linear=False)
@@ -94,6 +100,8 @@ def test_runs_with_drawn_functions_are_those_of_a_plain_simulation():
     values["f_output_scale"] = 1.0 + 0.0 * values["f_output_scale"]
     values["g_input_gain"][:, 1] = 0.4
     values["g_initial_state"] = 0.1 * values["g_initial_state"]
+    if seen:  # it stays where its function is known
+        values["g_output_gain"][1] *= 0.1
     values["g_noise_gain_unit"] = 0.3 * values["g_noise_gain_unit"]
     system = system_at(model, values)
     loop = ClosedLoop(model, system, record)
@@ -116,7 +124,7 @@ def test_runs_with_drawn_functions_are_those_of_a_plain_simulation():
         x = np.broadcast_to(x, (count,)) if x.size == 1 else x
         return np.array([np.interp(a, grid, f) for a, f in zip(x, drawn, strict=True)])
 
-    expected = loop.simulate(functions, rng)[..., 0]
+    expected = loop.simulate(functions, rng, seen)[..., 0]
     with torch.random.fork_rng():
         torch.manual_seed(1)
         process = output_process(system, model.prepare(record)[0])
@@ -156,9 +164,9 @@ def test_a_function_in_feedback_keeps_its_value_beyond_its_inducing_points():
         assert float(run.signals["f"][0, 0]) == pytest.approx(float(end), abs=2.0 * step * width)
 
 
-@pytest.mark.parametrize("outputs", [1, 2])
-def test_gradient_is_that_of_finite_differences(outputs):
-    model = spring(outputs)
+@pytest.mark.parametrize(("outputs", "hidden"), [(1, 0), (2, 0), (1, 1)])
+def test_gradient_is_that_of_finite_differences(outputs, hidden):
+    model = spring(outputs, hidden=hidden)
     record = make_record(1, outputs, irregular=True)
     model = model.scaled_to(record)
     potential = Potential(model, (record,), values_of(model, record, seed=3, linear=False))

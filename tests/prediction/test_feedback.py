@@ -95,6 +95,54 @@ def test_every_verb(fitted, tmp_path):
         assert np.isfinite(verb(mode).mean).all()
 
 
+def rubbed(n, seed, noise=0.02):
+    """x'' + 0.3 x' + 0.8 tanh(20 x') + 4 x = u; the position is measured, friction sees x'."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(3.0 * rng.standard_normal(n // 5 + 1), 5)[:n]
+    x, v, out = 0.0, 0.0, np.empty(n)
+    for k in range(n):
+        out[k] = x
+        for _ in range(40):
+            v += STEP / 40 * (u[k] - 0.3 * v - 0.8 * np.tanh(20.0 * v) - 4.0 * x)
+            x += STEP / 40 * v
+    y = out + noise * out.std() * rng.standard_normal(n)
+    return dgp.Record(time=STEP * np.arange(n), inputs=u, outputs=y), out, noise * out.std()
+
+
+def test_friction_acts_on_a_velocity_that_nothing_measures(tmp_path):
+    """With a hidden signal near the noise; with a function of the position far from it."""
+    record, truth, sd = rubbed(700, 0)
+    train, later = record[:500], record[500:]
+    options = {"method": "map", "workers": 1, "progress": False, "seed": 0}
+    model = dgp.NonlinearFeedback(1, hidden=1, process_noise=False)
+    assert [wire.sources for wire in model.wires] == [("inputs",), ("g",), ("g_hidden",)]
+    fit = dgp.fit(model, train, **options)
+
+    def error(found):
+        return np.sqrt(np.mean((found.forecast(train, later).mean[:, 0] - truth[500:]) ** 2))
+
+    assert error(fit) < 0.8 * sd  # of the noise-free output
+    with warnings.catch_warnings():  # it says itself that its free runs are poor
+        warnings.simplefilter("ignore", UserWarning)
+        plain = dgp.fit(dgp.NonlinearFeedback(1, process_noise=False), train, **options)
+    assert error(plain) > 3.0 * sd
+    # The hidden signal is the velocity, but for its size and sign.
+    layers = fit.layers(train)
+    assert set(layers) == {"g", "g_hidden", "f1", "f2"}
+    velocity = np.gradient(truth[:500], STEP)
+    assert abs(np.corrcoef(layers["g_hidden"].mean[:, 0], velocity)[0, 1]) > 0.95
+    # Its function is steepest where it changes its sign.
+    band = fit.static_function("f2", train)
+    slope = np.abs(np.gradient(band.mean[:, 0], band.x))
+    assert abs(band.x[slope.argmax()]) < 0.25 * np.ptp(band.inputs)
+    data = fit.to_arviz().posterior
+    assert data["g_output_gain"].dims[2:] == ("g_output", "pair", "part")
+    assert list(data["g_output"].values) == ["g", "g_hidden"]
+    path = tmp_path / "friction.safetensors"
+    fit.save(path)
+    np.testing.assert_array_equal(dgp.load(path).simulate(later).mean, fit.simulate(later).mean)
+
+
 def test_runs_from_far_beyond_the_data_come_back(fitted):
     """A hundred ranges away: what comes back keeps its value there, and the poles are stable."""
     fit, record = fitted
@@ -170,6 +218,22 @@ def test_same_bits_with_one_and_two_workers():
         (lambda: spring(likelihood=dgp.Heteroscedastic(of="output")), "varies with the inputs"),
         (lambda: dgp.Cascade(1, (dgp.Dynamic(feedback=("g",)),)), "later static layers"),
         (lambda: dgp.Cascade(1, (dgp.Dynamic(feedback="f"), dgp.Static())), "expected a tuple"),
+        (lambda: dgp.Cascade(1, (dgp.Dynamic(hidden=1), dgp.Static())), "hidden of layer 'g'"),
+        (
+            lambda: dgp.Cascade(
+                1, (dgp.Dynamic(hidden=1, feedback=("f",)), dgp.Static()), output="g"
+            ),
+            "a function that sees 'g_hidden'",
+        ),
+        (
+            lambda: dgp.Cascade(1, (dgp.Dynamic(hidden=1), dgp.Static(sees=("g_hidden",)))),
+            "in a layer with feedback",
+        ),
+        (
+            lambda: dgp.Cascade(1, (dgp.Dynamic(hidden=1), dgp.Static(name="g_hidden"))),
+            "a name of its own",
+        ),
+        (lambda: dgp.NonlinearFeedback(1, hidden=-1), "hidden: expected a whole number >= 0"),
         (
             lambda: dgp.Cascade(1, (dgp.Static(), dgp.Dynamic(feedback=("f",)))),
             "of later static layers, of []",

@@ -64,7 +64,8 @@ def extended_starts(
         own = {_renamed(site, {name: "g"}): value for site, value in learnt.items()}
         linear = grown(own, fresh, twin.all_sites(training[0].scaling, len(training)))
     topped = isinstance(model.layers[-1], Static) and isinstance(base.model.layers[-1], Dynamic)
-    hidden = any(layer.hidden for _, layer in model.dynamic)
+    hidden, before = (any(d.hidden for _, d in one.dynamic) for one in (model, base.model))
+    rescaled = topped or (hidden and not before)
     plans = [Plan(name, fresh, False, seed), Plan(name, linear, False, seed)]
     if hidden:
         plans.append(Plan(name, linear, False, seed, ahead=False))
@@ -72,7 +73,7 @@ def extended_starts(
         plans.append(Plan(name, linear, True, seed))
     with seeded(seed):  # what has no typical value is drawn
         new, *starts = [starting_point(model, records, plan) for plan in plans]
-    if (topped or hidden) and leading is not None:  # scaled as the other signals ask for
+    if rescaled and leading is not None:  # scaled as the other signals ask for
         learnt = {k: v for k, v in learnt.items() if not k.startswith(f"{leading.name}_")}
     return [grown(learnt, start, sites) for start in starts], new
 
