@@ -159,15 +159,14 @@ class _Filter(torch.autograd.Function):
         results = each(lambda b: filtering.run(layout, elements[b]), len(elements))
         ctx.layout = layout
         ctx.elements = elements
-        ctx.starts = [(r[1], r[2]) for r in results]
+        ctx.tracks = [r[1] for r in results]
         return torch.tensor([r[0] for r in results], dtype=torch.float64, device=args[0].device)
 
     @staticmethod
     def backward(ctx: Any, *bars: Tensor) -> Any:
         def gradient(b: int) -> Values:
             out = zero_bars(ctx.elements[b])
-            means, covariances = ctx.starts[b]
-            return reverse.run_adjoint(ctx.layout, ctx.elements[b], out, means, covariances)
+            return reverse.run_adjoint(ctx.layout, ctx.elements[b], out, ctx.tracks[b])
 
         scale = array(bars[0])
         gradients = each(gradient, len(ctx.elements))
