@@ -6,6 +6,7 @@ import multiprocessing
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from typing import Any
 
 import joblib
@@ -137,6 +138,12 @@ def make_layout(
     )
 
 
+@lru_cache
+def _processors() -> int:
+    """Asked once: the answer is in files that take longer to read than a short record to filter."""
+    return int(joblib.cpu_count())
+
+
 def each(function: Callable[[int], Any], count: int) -> list[Any]:
     """Apply to 0..count-1, on threads: the compiled code holds no lock.
 
@@ -144,11 +151,18 @@ def each(function: Callable[[int], Any], count: int) -> list[Any]:
     Elements do not meet, so that the numbers do not depend on the number of threads.
     """
     alone = multiprocessing.parent_process() is None
-    threads = min(count, joblib.cpu_count() if alone else 1)
+    threads = min(count, _processors() if alone else 1)
     if threads <= 1:
         return [function(b) for b in range(count)]
-    with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(function, range(count)))
+    parts = [range(first, count, threads) for first in range(threads)]
+
+    def work(part: range) -> list[Any]:
+        return [function(b) for b in part]
+
+    with ThreadPoolExecutor(threads - 1) as pool:
+        others = [pool.submit(work, part) for part in parts[1:]]
+        found = [work(parts[0]), *(other.result() for other in others)]
+    return [found[b % threads][b // threads] for b in range(count)]
 
 
 class _Filter(torch.autograd.Function):
