@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from pyro_dynogp.moments.measured_function import bench
+from pyro_dynogp.moments.nodes import bench
 from pyro_dynogp.support.compiled import OPTIONS
 
 # Added to the variance of a layer's input: a deterministic one is a Gaussian of this variance.

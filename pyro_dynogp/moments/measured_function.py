@@ -28,117 +28,27 @@ import math
 import numpy as np
 from numba import njit
 
-from pyro_dynogp.lti.lanes import (
-    WIDTH,
-    below,
-    choose,
-    exponential,
-    get,
-    larger,
-    put,
-    root,
-    splat,
-    total,
+from pyro_dynogp.lti.lanes import WIDTH, choose, exponential, get, larger, put, root, splat, total
+from pyro_dynogp.moments.nodes import (
+    COUNT,
+    LOG_WEIGHTS,
+    MORE,
+    NODES,
+    OUTER,
+    ROOM,
+    SPACING,
+    SQUARE,
+    STANDARD,
+    VECTORS,
+    WIDE,
+    corner_bars,
+    cubic,
+    locate,
+    take,
 )
-from pyro_dynogp.support.compiled import BORROWING, OPTIONS, WITHIN
+from pyro_dynogp.support.compiled import BORROWING, WITHIN
 
-# The sum reproduces a Gaussian's density to 1e-7 up to five standard deviations. With this SPREAD
-# the nodes sqrt(3) SPREAD beside a component's are the second neighbours.
-SPACING, REACH = 0.2, 33
-SPREAD = 2.0 * SPACING / math.sqrt(3.0)
-COUNT = 2 * REACH + 1
-_SQUARE = SPREAD * SPREAD
-# Vectors of components; those that fill the last one have no weight. The function is needed two
-# nodes further on either side, with which it fills one vector more.
-_VECTORS = -(-COUNT // WIDTH)
-_MORE = _VECTORS + 1
-_ROOM, _WIDE = WIDTH * _VECTORS, WIDTH * _MORE
-NODES = SPACING * (np.arange(float(_ROOM)) - REACH)
-_PLACES = np.arange(float(_WIDE))
-_OUTER = SPACING * (_PLACES - (REACH + 2))
-
-
-def _log_weights(variance: float) -> np.ndarray:
-    """Of a normal distribution's values at the nodes, adding up to one."""
-    density = np.where(np.arange(_ROOM) < COUNT, -0.5 * NODES**2 / variance, -1e300)
-    return np.asarray(density - np.log(np.exp(density).sum()))
-
-
-# Of the components, and of the standard normal distribution itself.
-LOG_WEIGHTS = _log_weights(1.0 - _SQUARE)
-STANDARD = np.exp(_log_weights(1.0))
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
-
-
-@njit(**OPTIONS)
-def bench(components):
-    """Work arrays of the following functions, in whole vectors.
-
-    Returns:
-        Function at all nodes and two more on either side; of these nodes the first of four grid
-        points, place between the second and the third, and 1 within the table; the four values of
-        mean and variance there, or the gradients by them; of each component mean, variance beside
-        the line, slope by xi; for each part of the noise weights, and inverse variances of y;
-        gradients by the function, two and four nodes late, and by the variance; one vector.
-    """
-    return (
-        np.zeros(_WIDE),
-        np.zeros((3, _WIDE)),
-        np.zeros((8, _WIDE)),
-        np.zeros((3, _ROOM)),
-        np.zeros((components, _ROOM)),
-        np.zeros((components, _ROOM)),
-        np.zeros((4, _WIDE + WIDTH)),
-        np.zeros(WIDTH),
-    )
-
-
-@njit(**BORROWING)
-def _locate(low, spacing, count, centre, sd, place):
-    """Write where the nodes centre + sd xi lie on the grid, as `functions.place` has it."""
-    scale = 1.0 / spacing
-    stride = sd * SPACING * scale
-    start = splat((centre - low) * scale - stride * (REACH + 2))
-    one = splat(1.0)
-    end = splat(count - 2.0)
-    for v in range(_MORE):
-        t = start + splat(stride) * get(_PLACES, v)
-        inside = choose(t - end, splat(0.0), choose(t - one, one, splat(0.0)))
-        t = choose(t - end, end, choose(t - one, t, one))
-        first = below(t)
-        first = choose(first - splat(count - 3.0), splat(count - 3.0), first)
-        put(place, v, first - one)
-        put(place, _MORE + v, t - first)
-        put(place, 2 * _MORE + v, inside)
-
-
-@njit(**BORROWING)
-def _take(mean, variance, place, corner):
-    """Write the four values of the tables around each node; those of the variance two places on."""
-    for j in range(_WIDE):
-        k = int(place[0, j])
-        for b in range(4):
-            corner[b, j] = mean[k + b]
-    for j in range(_ROOM):
-        k = int(place[0, j + 2])
-        for b in range(4):
-            corner[4 + b, j] = variance[k + b]
-
-
-@njit(**BORROWING)
-def _cubic(corner, v, u):
-    """Value and derivative by u of `functions.cubic`; v: vector of the first of four rows."""
-    a = get(corner, v)
-    b = get(corner, _MORE + v)
-    c = get(corner, 2 * _MORE + v)
-    d = get(corner, 3 * _MORE + v)
-    half = splat(0.5)
-    two = splat(2.0)
-    one = half * (c - a)
-    square = a - splat(2.5) * b + two * c - half * d
-    cube = splat(1.5) * (b - c) + half * (d - a)
-    value = b + u * (one + u * (square + u * cube))
-    return value, one + u * (two * square + u * splat(3.0) * cube)
 
 
 @njit(**WITHIN)
@@ -147,21 +57,21 @@ def _evaluate(i, layout, values, centre, sd, work):
     mean = values.table_mean[layout.f_start[i]]
     variance = values.table_variance[layout.f_start[i]]
     f, place, at, corner = work.curve, work.place, work.at, work.corner
-    _locate(values.low[i], values.spacing[i], mean.shape[0], centre, sd, place)
-    _take(mean, variance, place, corner)
-    for v in range(_MORE):
-        value, _ = _cubic(corner, v, get(place, _MORE + v))
+    locate(values.low[i], values.spacing[i], mean.shape[0], centre, sd, place)
+    take(mean, variance, place, corner)
+    for v in range(MORE):
+        value, _ = cubic(corner, v, get(place, MORE + v))
         put(f, v, value)
     middle, last, share = f[2:], f[4:], place[1, 2:]
-    for v in range(_VECTORS):
-        own, _ = _cubic(corner, 4 * _MORE + v, get(share, v))
+    for v in range(VECTORS):
+        own, _ = cubic(corner, 4 * MORE + v, get(share, v))
         a = get(f, v)
         b = get(middle, v)
         c = get(last, v)
         bend = a - splat(2.0) * b + c
         put(at, v, b + bend * splat(1.0 / 6.0))
-        put(at, _VECTORS + v, larger(own, splat(0.0)) + bend * bend * splat(1.0 / 18.0))
-        put(at, 2 * _VECTORS + v, (c - a) * splat(0.25 / SPACING))
+        put(at, VECTORS + v, larger(own, splat(0.0)) + bend * bend * splat(1.0 / 18.0))
+        put(at, 2 * VECTORS + v, (c - a) * splat(0.25 / SPACING))
 
 
 @njit(**BORROWING)
@@ -170,10 +80,10 @@ def _given_output(v, y, inverse, at):
 
     inverse: of the variance of y.
     """
-    slope = get(at, 2 * _VECTORS + v)
-    along = splat(_SQUARE) * slope * inverse
+    slope = get(at, 2 * VECTORS + v)
+    along = splat(SQUARE) * slope * inverse
     first = get(NODES, v) + along * (splat(y) - get(at, v))
-    return along, first, splat(_SQUARE) * (splat(1.0) - along * slope)
+    return along, first, splat(SQUARE) * (splat(1.0) - along * slope)
 
 
 @njit(**WITHIN)
@@ -188,13 +98,13 @@ def _weigh(y, R, share, multiple, work):
     for k in range(share.shape[0]):
         level = splat(math.log(share[k]))
         noise = splat(R * multiple[k])
-        for v in range(_VECTORS):
+        for v in range(VECTORS):
             r = splat(y) - get(at, v)
-            slope = get(at, 2 * _VECTORS + v)
-            S = slope * slope * splat(_SQUARE) + get(at, _VECTORS + v) + noise
+            slope = get(at, 2 * VECTORS + v)
+            S = slope * slope * splat(SQUARE) + get(at, VECTORS + v) + noise
             t = get(LOG_WEIGHTS, v) + level - splat(0.5) * r * r / S
-            put(inverses, k * _VECTORS + v, splat(1.0) / S)
-            put(weights, k * _VECTORS + v, t)
+            put(inverses, k * VECTORS + v, splat(1.0) / S)
+            put(weights, k * VECTORS + v, t)
             most = larger(t, most)
     put(work.lanes, 0, most)
     top = -np.inf
@@ -204,11 +114,11 @@ def _weigh(y, R, share, multiple, work):
     mean = splat(0.0)
     second = splat(0.0)
     for k in range(share.shape[0]):
-        for v in range(_VECTORS):
-            inverse = get(inverses, k * _VECTORS + v)
-            weight = exponential(get(weights, k * _VECTORS + v) - splat(top)) * root(inverse)
+        for v in range(VECTORS):
+            inverse = get(inverses, k * VECTORS + v)
+            weight = exponential(get(weights, k * VECTORS + v) - splat(top)) * root(inverse)
             _, first, spread = _given_output(v, y, inverse, at)
-            put(weights, k * _VECTORS + v, weight)
+            put(weights, k * VECTORS + v, weight)
             weighed = weighed + weight
             mean = mean + weight * first
             second = second + weight * (spread + first * first)
@@ -260,22 +170,22 @@ def _weigh_adjoint(y, multiple, scale, mean_bar, second_bar, level, work):
     at, bars = work.at, work.curve_bar
     early, middle, late = bars[0, 4:], bars[1, 4:], bars[2, 4:]
     f, f2, f4 = work.curve, work.curve[2:], work.curve[4:]
-    square = splat(_SQUARE)
+    square = splat(SQUARE)
     two = splat(2.0)
     half = splat(0.5)
     first_order = splat(mean_bar)
     second_order = splat(second_bar)
     y_bar = splat(0.0)
     R_bar = splat(0.0)
-    for v in range(_VECTORS):
+    for v in range(VECTORS):
         r = splat(y) - get(at, v)
-        s = get(at, 2 * _VECTORS + v)
+        s = get(at, 2 * VECTORS + v)
         f_bar = splat(0.0)
         v_bar = splat(0.0)
         slope_bar = splat(0.0)
         for k in range(multiple.shape[0]):
-            inverse = get(work.inverses, k * _VECTORS + v)
-            weight = splat(scale) * get(work.weights, k * _VECTORS + v)
+            inverse = get(work.inverses, k * VECTORS + v)
+            weight = splat(scale) * get(work.weights, k * VECTORS + v)
             along, first, spread = _given_output(v, y, inverse, at)
             term = first_order * first + second_order * (spread + first * first) + splat(level)
             term_bar = weight * term
@@ -302,51 +212,39 @@ def _weigh_adjoint(y, multiple, scale, mean_bar, second_bar, level, work):
     return total(y_bar), total(R_bar)
 
 
-@njit(**BORROWING)
-def _corner_bars(corner, v, u, bar):
-    """Write the gradients by the four values of a cubic over these; its own is `bar`."""
-    square = u * u
-    cube = square * u
-    half = splat(0.5)
-    put(corner, v, bar * (square - half * (cube + u)))
-    put(corner, _MORE + v, bar * (splat(1.5) * cube - splat(2.5) * square + splat(1.0)))
-    put(corner, 2 * _MORE + v, bar * (splat(2.0) * square - splat(1.5) * cube + half * u))
-    put(corner, 3 * _MORE + v, bar * (half * (cube - square)))
-
-
 @njit(**WITHIN)
 def _evaluate_adjoint(i, layout, values, bars, centre, sd, work):
     """Reverse of `_evaluate`: adds to bars; gradients by centre and sd."""
     place, corner = work.place, work.corner
     # The function at a node is in the lines of its own component and of its second neighbours.
     early, middle, late = work.curve_bar[0, 4:], work.curve_bar[1, 2:], work.curve_bar[2]
-    own, share, inside, outer = work.curve_bar[3], place[1, 2:], place[2, 2:], _OUTER[2:]
+    own, share, inside, outer = work.curve_bar[3], place[1, 2:], place[2, 2:], OUTER[2:]
     centre_bar = splat(0.0)
     sd_bar = splat(0.0)
-    for v in range(_MORE):
-        u = get(place, _MORE + v)
+    for v in range(MORE):
+        u = get(place, MORE + v)
         bar = get(early, v) + get(middle, v) + get(late, v)
-        _, slope = _cubic(corner, v, u)
-        z_bar = bar * slope * get(place, 2 * _MORE + v)
+        _, slope = cubic(corner, v, u)
+        z_bar = bar * slope * get(place, 2 * MORE + v)
         centre_bar = centre_bar + z_bar
-        sd_bar = sd_bar + z_bar * get(_OUTER, v)
-        _corner_bars(corner, v, u, bar)
-    for v in range(_VECTORS):
+        sd_bar = sd_bar + z_bar * get(OUTER, v)
+        corner_bars(corner, v, u, bar)
+    for v in range(VECTORS):
         u = get(share, v)
-        variance, slope = _cubic(corner, 4 * _MORE + v, u)
+        variance, slope = cubic(corner, 4 * MORE + v, u)
         # Where a negative one was cut off there is no gradient.
         bar = choose(variance, get(own, v), splat(0.0))
         z_bar = bar * slope * get(inside, v)
         centre_bar = centre_bar + z_bar
         sd_bar = sd_bar + z_bar * get(outer, v)
-        _corner_bars(corner, 4 * _MORE + v, u, bar)
+        corner_bars(corner, 4 * MORE + v, u, bar)
     mean_bars = bars.table_mean[layout.f_start[i]]
     variance_bars = bars.table_variance[layout.f_start[i]]
-    for j in range(_WIDE):
+    for j in range(WIDE):
         k = int(place[0, j])
         for b in range(4):
             mean_bars[k + b] += corner[b, j]
-    for j in range(_ROOM):
+    for j in range(ROOM):
         k = int(place[0, j + 2])
         for b in range(4):
             variance_bars[k + b] += corner[4 + b, j]

@@ -8,8 +8,9 @@ import torch
 
 from pyro_dynogp.layers.noise import student_components
 from pyro_dynogp.moments.layout import Values, workspace, zero_bars
-from pyro_dynogp.moments.measured_function import COUNT, REACH, SPACING, SPREAD, function_adjoint
+from pyro_dynogp.moments.measured_function import function_adjoint
 from pyro_dynogp.moments.measured_function import function_terms as compiled
+from pyro_dynogp.moments.nodes import COUNT, REACH, SPACING, SPREAD
 from pyro_dynogp.moments.problem import TABLE, make_layout
 
 GRID = 120
