@@ -97,7 +97,10 @@ def take(mean, variance, place, corner):
 
 @njit(**BORROWING)
 def cubic(corner, v, u):
-    """Value and derivative by u of `functions.cubic`; v: vector of the first of four rows."""
+    """Value of what `functions.cubic_weights` has, and its derivative by u.
+
+    v: vector of the first of four rows.
+    """
     a = get(corner, v)
     b = get(corner, MORE + v)
     c = get(corner, 2 * MORE + v)
