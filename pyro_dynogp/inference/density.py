@@ -15,8 +15,9 @@ from torch.distributions import biject_to
 from torch.distributions.transforms import Transform
 
 from pyro_dynogp.inference.linear_density import LinearEnergy, linear_density
-from pyro_dynogp.inference.log_joint import LogJoint, density_of
+from pyro_dynogp.inference.log_joint import Direct, LogJoint, density_of
 from pyro_dynogp.inference.optimise.descent import WIDEST, bounded_root, descend, hessian
+from pyro_dynogp.inference.priors_of_vectors import Constrained, vector_priors
 from pyro_dynogp.layers.sites import Arguments, Program
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
 
@@ -129,6 +130,7 @@ class Potential:
     Args:
         model: a Pyro function. args: what it is called with.
         values: a value for every latent site, at which the model is traced once.
+        fixed: values of sites that do not vary; then `model` is called with these.
 
     Raises:
         ValueError: where a latent site has no value.
@@ -136,10 +138,18 @@ class Potential:
 
     nearly_normal = False
 
-    def __init__(self, model: Program, args: Arguments, values: Mapping[str, Tensor]) -> None:
-        self.model, self.args, self.at = model, args, dict(values)
-        self.log_density = density_of(model, args)
-        # The same without tensors, where there is such a form.
+    def __init__(
+        self,
+        model: Program,
+        args: Arguments,
+        values: Mapping[str, Tensor],
+        fixed: Mapping[str, Tensor] | None = None,
+    ) -> None:
+        self.model = pyro.poutine.condition(model, data=dict(fixed)) if fixed else model
+        self.args, self.at = args, dict(values)
+        self.log_density = density_of(model, args, fixed)
+        # Priors, and of a linear model all of it, without tensors, where there is such a form.
+        self.priors = vector_priors(getattr(self.log_density, "sites", []))
         self.linear = linear_density(self.log_density)
         self.sites: list[Site] = []
         latent, count = self.log_density.latent(values)
@@ -188,6 +198,11 @@ class Potential:
             points = z if z.dim() > 1 else z[None]
             energy: Tensor = LinearEnergy.apply(points, self.linear, jacobian)
             return energy if z.dim() > 1 else energy[0]
+        if self.priors is not None:
+            x, prior = Constrained.apply(z if z.dim() > 1 else z[None], self.priors, jacobian)
+            x, prior = (x, prior) if z.dim() > 1 else (x[0], prior[0])
+            assert isinstance(self.log_density, Direct)
+            return -(prior + self.log_density.likelihood(self.priors.by_site(x)))
         return joint_energy(self.log_density, self.sites, z, jacobian=jacobian)
 
     def log_jacobian(self, z: Tensor) -> Tensor:

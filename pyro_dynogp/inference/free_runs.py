@@ -48,7 +48,7 @@ def free_run_error(
             assembly = assemble(here, record.grid, record.scaled_inputs)
             problem = assembly.with_outputs(record.scaled_outputs)
             (numbers,), _ = problem.elements()
-            means = filtering.run(problem.layout, numbers)[1]
+            means = filtering.run(problem.layout, numbers)[1].means
             length = SEGMENT * max(LEAST, -(-len(means) // BLOCKS))
             for first in range(0, len(record), length):
                 part = slice(first, first + length)

@@ -20,7 +20,7 @@ from torch import Tensor
 from pyro_dynogp.data.scaling import TimeScale
 from pyro_dynogp.inference.linear_systems import LinearSystems
 from pyro_dynogp.inference.log_joint import Direct
-from pyro_dynogp.inference.priors_of_vectors import VectorPriors
+from pyro_dynogp.inference.priors_of_vectors import VectorPriors, vector_priors
 from pyro_dynogp.lti.held_lanes import Signals
 from pyro_dynogp.lti.likelihood import Past, Systems, Tape, gradients, innovations_of
 from pyro_dynogp.models.past_inputs import LEVEL
@@ -66,18 +66,15 @@ def _data(record: PreparedRecord, systems: LinearSystems) -> _Data:
 
 def linear_density(density: object) -> LinearDensity | None:
     """The density of a model to which this module applies; None for others."""
-    if not isinstance(density, Direct):
+    if not isinstance(density, Direct) or density.fixed:
         return None
     model = density.model
     if not (model.is_linear and model.likelihood.gaussian and not model.likelihood.varying):
         return None
     if model.state_sites or model.initial_state == "zero" or model.has_feedback:
         return None
-    try:
-        priors = VectorPriors(density.sites)
-    except LookupError:  # a prior without a form in numpy
-        return None
-    return LinearDensity(density, priors)
+    priors = vector_priors(density.sites)
+    return None if priors is None else LinearDensity(density, priors)
 
 
 class LinearDensity:

@@ -129,15 +129,21 @@ class Direct:
     records, priors) is made once.
 
     Attributes:
-        records: prepared for the model. sites: in the order in which the model samples them.
+        records: prepared for the model. sites: in the order in which the model samples them, but
+            those that are fixed.
+        fixed: values (*shape) of sites that do not vary; their priors count.
         observations: y of each record [output].
     """
 
-    def __init__(self, model: Model, records: Records) -> None:
+    def __init__(self, model: Model, records: Records, fixed: Values | None = None) -> None:
         self.model = model
         self.records = model.prepare(records)
-        self.sites = model.all_sites(self.records[0].scaling, len(self.records))
+        self.fixed = {name: value.detach() for name, value in (fixed or {}).items()}
+        sites = model.all_sites(self.records[0].scaling, len(self.records))
+        self.sites = [site for site in sites if site.name not in self.fixed]
         self.prior = Priors(self.sites)
+        held = [site for site in sites if site.name in self.fixed]
+        self._constant = Priors(held).log_prob(self.fixed) if held else torch.zeros(())
         self.observations = [record.observations for record in self.records]
         self._at_limits = [at_limits(model.layers, each.record) for each in self.records]
 
@@ -159,8 +165,16 @@ class Direct:
 
     def __call__(self, values: Values, count: int | None) -> Tensor:
         """See `LogJoint`."""
-        total = self.prior.log_prob(values)
-        each = zip(self.outputs(values), self.observations, self._at_limits, strict=True)
+        return self.prior.log_prob(values) + self.likelihood(values)
+
+    def likelihood(self, values: Values) -> Tensor:
+        """Log-density () or (k,) of outputs and fixed sites at values (*shape) or (k, *shape)."""
+        total, some = self._constant.to(torch.float64), dict(values)
+        if self.fixed:
+            site = self.sites[0]
+            lead = values[site.name].shape[: values[site.name].dim() - len(site.shape)]
+            some |= {name: x.expand(lead + x.shape) for name, x in self.fixed.items()}
+        each = zip(self.outputs(some), self.observations, self._at_limits, strict=True)
         for outputs, y, at in each:
             total = total + outputs.log_prob(y)
             if at.any():
@@ -173,15 +187,18 @@ def _refuse_unset(names: Sequence[str]) -> None:
         raise invalid("values", expected=f"a value for every latent site, {names} too", got="none")
 
 
-def density_of(model: Program, args: Arguments) -> Direct | Traced:
-    """The density of a model given what it is called with: directly where that is possible."""
+def density_of(model: Program, args: Arguments, fixed: Values | None = None) -> Direct | Traced:
+    """The density of a model given what it is called with: directly where that is possible.
+
+    fixed: values of sites that do not vary.
+    """
     if isinstance(model, Model) and model.integrate == "all" and len(args) == 1:
         (given,) = args
         records: Any = given if isinstance(given, Sequence) else (given,)
         measured = [x.record if isinstance(x, PreparedRecord) else x for x in records]
         if all(record.n_outputs for record in measured):
-            return Direct(model, records)
-    return Traced(model, args)
+            return Direct(model, records, fixed)
+    return Traced(pyro.poutine.condition(model, data=dict(fixed)) if fixed else model, args)
 
 
 def log_joint_of(

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from pyro.distributions import HalfCauchy, HalfNormal, LogNormal, Normal, Uniform
+from torch import Tensor
 
 from pyro_dynogp.distributions.decay import LogDecayRate
 from pyro_dynogp.distributions.shared_scale import SharedScaleNormal
@@ -43,6 +44,31 @@ class _Slices(NamedTuple):
     square: float
 
 
+class Constrained(torch.autograd.Function):
+    """Values x (k, d) of vectors u (k, d) and their log prior density (k,), as nodes of a graph.
+
+    With `jacobian` the density is that of the vectors.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, z: Tensor, priors: VectorPriors, jacobian: bool) -> Any:
+        """Values and densities; derivatives are made at once."""
+        with np.errstate(all="ignore"):  # what is out of range ends as NaN, which is told apart
+            values = priors.values(z.detach().numpy())
+            total, by_x = priors.log_prob(values.x)
+            by_u = by_x * values.slope
+            if jacobian:
+                total, by_u = total + values.log_jacobian, by_u + values.log_jacobian_slope
+        ctx.slopes = torch.from_numpy(values.slope), torch.from_numpy(by_u)
+        return torch.from_numpy(values.x), torch.from_numpy(total)
+
+    @staticmethod
+    def backward(ctx: Any, *bars: Tensor) -> Any:
+        """Gradients by the vectors."""
+        slope, by_u = ctx.slopes
+        return bars[0] * slope + bars[1][:, None] * by_u, None, None
+
+
 class VectorPriors:
     """Priors of all sites of a model.
 
@@ -65,6 +91,7 @@ class VectorPriors:
             self._add(site, np.arange(start, stop), kinds)
             start = stop
         self.size = start
+        self.shapes = [site.shape for site in sites]
         # Columns of each kind: entries, then two parameters where it has any.
         self._kinds = {name: np.concatenate(found, 1) for name, found in kinds.items()}
 
@@ -114,6 +141,12 @@ class VectorPriors:
             return None
         entries, first, second = self._kinds[kind]
         return entries.astype(int), first, second
+
+    def by_site(self, x: Tensor) -> dict[str, Tensor]:
+        """Each site's part (*s, *shape) of values x (*s, d)."""
+        parts = x.split([shape.numel() for shape in self.shapes], -1)
+        named = zip(self.places, parts, self.shapes, strict=True)
+        return {name: part.reshape(x.shape[:-1] + shape) for name, part, shape in named}
 
     def values(self, u: np.ndarray) -> Values:
         """Of unconstrained vectors u (k, d)."""
@@ -177,3 +210,11 @@ class VectorPriors:
                 total -= 0.5 * power * np.log(size / square)
                 by_x[:, one] -= (power / size)[:, None] * here
         return total, by_x
+
+
+def vector_priors(sites: Sequence[Site]) -> VectorPriors | None:
+    """Priors of all sites; None where there is none, or one of another kind."""
+    try:
+        return VectorPriors(sites) if sites else None
+    except LookupError:
+        return None

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.layers.kernels import SampledKernel
+from pyro_dynogp.layers.one_channel import FORMS, moments_along
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.tensors import broadcast
@@ -119,7 +120,11 @@ class StaticFunction:
 
     def mean(self, x: Tensor) -> Tensor:
         """Conditional mean E[f(x) | v] (*b, n, e) at points x (*b, n, d)."""
-        return self.prior_mean(x) + self.kernel(x, self.locations) @ self.weights.mT
+        prior_mean = self.prior_mean(x)
+        found = self._along(x, explained=False)
+        if found is not None:
+            return prior_mean + found[0]
+        return prior_mean + self.kernel(x, self.locations) @ self.weights.mT
 
     def variance(self, x: Tensor) -> Tensor:
         """Conditional variance Var[f(x) | v] (*b, n, e) at points x (*b, n, d), at least zero."""
@@ -128,12 +133,33 @@ class StaticFunction:
     def moments(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """`mean` and `variance` at points x (*b, n, d), for the cost of one kernel evaluation."""
         prior_mean = self.prior_mean(x)
-        K = self.kernel(x, self.locations)
-        explained = _solve(self.root, K.mT).square().sum(-2)
+        found = self._along(x, explained=True)
+        if found is not None:
+            mean, explained = prior_mean + found[0], found[1]
+        else:
+            K = self.kernel(x, self.locations)
+            explained = _solve(self.root, K.mT).square().sum(-2)
+            mean = prior_mean + K @ self.weights.mT
         share = (self.kernel.diagonal(x) - explained).clamp_min(0.0)
         variance = share.unsqueeze(-1) * self.output_scale.square().unsqueeze(-2)
-        mean = prior_mean + K @ self.weights.mT
         return mean, variance.expand(broadcast(mean.shape, variance.shape))
+
+    def _along(self, x: Tensor, *, explained: bool) -> tuple[Tensor, Tensor] | None:
+        """What weights add to the prior mean, and variance they explain; None in many channels."""
+        radial = self.kernel.radial if self.channels == 1 else None
+        if radial is None or radial[0] not in FORMS:
+            return None
+        scale = self.kernel.radial_variance
+        scale = torch.ones((), dtype=torch.float64) if scale is None else scale
+        mean, share = moments_along(
+            radial[0],
+            radial[1].squeeze(-1),
+            x.squeeze(-1),
+            self.locations.squeeze(-1),
+            self.weights * scale[..., None, None],
+            self.root if explained else None,
+        )
+        return mean, share * scale.square().unsqueeze(-1)
 
     def path(self, x: Tensor, residual: Tensor, support: Tensor) -> Tensor:
         """Values (*b, n, e) at x (*b, n, d) of one function drawn from f | v (Matheron's rule).

@@ -140,6 +140,21 @@ def _unary(name: str) -> Any:
 root = _unary("llvm.sqrt")
 magnitude = _unary("llvm.fabs")
 nearest = _unary("llvm.rint")
+below = _unary("llvm.floor")
+
+
+@intrinsic
+def total(typing: Any, x: Any) -> Any:
+    """Sum of all lanes: of neighbours, of those sums, and so on."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        parts = [builder.extract_element(args[0], _index(k)) for k in range(WIDTH)]
+        while len(parts) > 1:
+            pairs = zip(parts[::2], parts[1::2], strict=True)
+            parts = [builder.fadd(a, b) for a, b in pairs]
+        return parts[0]
+
+    return types.float64(LANES), lower
 
 
 @intrinsic
@@ -178,6 +193,15 @@ def _series(coefficients, x):
 
 
 @njit(**BORROWING)
+def exponential(a):
+    """exp(a) for a <= 0 within 2 units in the last place; zero where it is below 1e-307."""
+    n = nearest(larger(a, splat(-708.0)) * splat(1.4426950408889634))
+    r = (larger(a, splat(-708.0)) - n * splat(_LOG_TWO[0])) - n * splat(_LOG_TWO[1])
+    size = (_series(_EXP, r) * (r * r) + r + splat(1.0)) * power_of_two(n)
+    return choose(a + splat(708.0), size, splat(0.0))
+
+
+@njit(**BORROWING)
 def complex_exponential(a, b):
     """exp(a + i b), real and imaginary part, for a <= 0; zero where it is below 1e-307.
 
@@ -186,10 +210,7 @@ def complex_exponential(a, b):
     """
     zero = splat(0.0)
     one = splat(1.0)
-    n = nearest(larger(a, splat(-708.0)) * splat(1.4426950408889634))
-    r = (larger(a, splat(-708.0)) - n * splat(_LOG_TWO[0])) - n * splat(_LOG_TWO[1])
-    size = (_series(_EXP, r) * (r * r) + r + one) * power_of_two(n)
-    size = choose(a + splat(708.0), size, zero)
+    size = exponential(a)
     q = nearest(b * splat(0.6366197723675814))
     t = ((b - q * splat(_HALF_PI[0])) - q * splat(_HALF_PI[1])) - q * splat(_HALF_PI[2])
     t = zero - larger(zero - larger(t, splat(-1.0)), splat(-1.0))

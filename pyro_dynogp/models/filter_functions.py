@@ -121,10 +121,13 @@ def _function(block: Block, M: int, widest: int) -> tuple[int, dict[str, Tensor]
         return TABLE, values
     if d == 1:
         low, high = block.ends or table_range(function)
-        mean, variance = function.moments(even_grid(low, high, GRID).unsqueeze(-1))
-        values["table_mean"] = mean.mT
+        points = even_grid(low, high, GRID).unsqueeze(-1)
         if block.with_variance:
+            mean, variance = function.moments(points)
             values["table_variance"] = variance.mT
+        else:
+            mean = function.mean(points)
+        values["table_mean"] = mean.mT
         values["low"] = low.unsqueeze(-1)
         values["spacing"] = ((high - low) / (GRID - 1)).unsqueeze(-1)
         return TABLE, values

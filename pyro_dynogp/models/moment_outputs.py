@@ -102,8 +102,8 @@ class MomentOutputs(OutputProcess):
         """See `OutputProcess`."""
 
         def compiled(layout: Layout, v: Values) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            _, means, covariances, _, _ = filtering.run(layout, v)
-            mean, variance, density = smoothing.leave_one_out(layout, v, means, covariances)
+            _, track, _, _ = filtering.run(layout, v)
+            mean, variance, density = smoothing.leave_one_out(layout, v, track)
             return mean, variance, density
 
         return self._moments(*self._pass(y, compiled))
@@ -130,8 +130,8 @@ class MomentOutputs(OutputProcess):
         elements, batch = problem.elements()
         N = problem.m0.shape[-1]
         ends = each(lambda b: filtering.run(problem.layout, elements[b]), len(elements))
-        m = torch.from_numpy(np.stack([end[3][:N] for end in ends])).reshape(*batch, N)
-        P = torch.from_numpy(np.stack([end[4][:N, :N] for end in ends])).reshape(*batch, N, N)
+        m = torch.from_numpy(np.stack([end[2][:N] for end in ends])).reshape(*batch, N)
+        P = torch.from_numpy(np.stack([end[3][:N, :N] for end in ends])).reshape(*batch, N, N)
         return JointState(assembly.known_state + m, P)
 
     def smooth(self, y: Tensor | None) -> dict[str, LayerMoments]:
@@ -149,10 +149,8 @@ class MomentOutputs(OutputProcess):
         joined = (torch.cat(rows, -2) if rows else nothing).contiguous().numpy()
 
         def compiled(b: int) -> tuple[np.ndarray, np.ndarray]:
-            _, means, covariances, _, _ = filtering.run(problem.layout, elements[b])
-            mean, variance = smoothing.smooth(
-                problem.layout, elements[b], joined[b], means, covariances
-            )
+            _, track, _, _ = filtering.run(problem.layout, elements[b])
+            mean, variance = smoothing.smooth(problem.layout, elements[b], joined[b], track)
             return mean @ joined[b].T, variance
 
         found = each(compiled, len(elements))

@@ -10,6 +10,7 @@ gamma f + noise. Where the output is a function of one signal, the update is tha
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -20,10 +21,25 @@ from pyro_dynogp.moments.measured_function import function_terms
 from pyro_dynogp.moments.noise import noise_terms
 from pyro_dynogp.moments.state import move, update
 from pyro_dynogp.moments.static_layer import append
-from pyro_dynogp.support.compiled import BORROWING, INLINED, OPTIONS
+from pyro_dynogp.support.compiled import BORROWING, INLINED, OPTIONS, WITHIN
 
 
-@njit(**BORROWING)
+class Track(NamedTuple):
+    """What a run keeps for what goes backwards through the record.
+
+    Attributes:
+        means: (segments, N) and covariances: (segments, N, N), the state before the outputs of each
+            segment's first sample.
+        alphas, betas: (n, n_y) by which each output changed the state; zero where it is missing.
+    """
+
+    means: np.ndarray
+    covariances: np.ndarray
+    alphas: np.ndarray
+    betas: np.ndarray
+
+
+@njit(**WITHIN)
 def enter(time, layout, values, m, P, T):
     """Move to sample `time`."""
     k = layout.step[time]
@@ -39,7 +55,7 @@ def seen(o, layout, values):
     return values.H[o]
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def output_terms(time, o, layout, values, m, P, c, work):
     """Write the covariance c of a with what output o is measured through; l, alpha and beta."""
     h = seen(o, layout, values)[: m.shape[0]]
@@ -53,7 +69,7 @@ def output_terms(time, o, layout, values, m, P, c, work):
     return noise_terms(y - dot(h, m), dot(h, c), R, layout.share, layout.multiple)
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def measure(time, layout, values, m, P, c, work, alphas, betas):
     """Use the outputs of one sample; the sum of their log-densities is returned.
 
@@ -94,7 +110,7 @@ def before_data(values, A):
 
 @njit(**OPTIONS)
 def run(layout, values):
-    """Log-density of a record, the state before each segment's first sample, and the last one.
+    """Log-density of a record, its `Track`, and the last state.
 
     The last one, (A,) and (A, A), is that of [x; f] given all data.
     """
@@ -108,8 +124,8 @@ def run(layout, values):
     work = workspace(layout, values)
     T = np.empty((N, A))
     c = np.empty(A)
-    alphas = np.empty(values.y.shape[1])
-    betas = np.empty(values.y.shape[1])
+    alphas = np.zeros((n, values.y.shape[1]))
+    betas = np.zeros((n, values.y.shape[1]))
     total = 0.0
     for time in range(n):
         enter(time, layout, values, m, P, T)
@@ -118,11 +134,11 @@ def run(layout, values):
             covariances[time // SEGMENT] = P[:N, :N]
         for i in range(inner(layout)):
             append(i, time, layout, values, m, P, work)
-        total += measure(time, layout, values, m, P, c, work, alphas, betas)
+        total += measure(time, layout, values, m, P, c, work, alphas[time], betas[time])
     last_m = np.zeros(values.G.shape[1])
     last_P = np.zeros((last_m.shape[0], last_m.shape[0]))
     last_m[:A] = m
     last_P[:A, :A] = P
     for i in range(inner(layout), layout.channels.shape[0]):
         append(i, n - 1, layout, values, last_m, last_P, work)
-    return total, means, covariances, last_m, last_P
+    return total, Track(means, covariances, alphas, betas), last_m, last_P

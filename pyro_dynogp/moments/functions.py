@@ -58,19 +58,6 @@ def place(t, count):
 
 
 @njit(**BORROWING)
-def cubic(values, first, u):
-    """Value of the interpolation that `cubic_weights` has, and its derivative by u."""
-    a = values[first]
-    b = values[first + 1]
-    c = values[first + 2]
-    d = values[first + 3]
-    one = 0.5 * (c - a)
-    two = a - 2.5 * b + 2.0 * c - 0.5 * d
-    three = 1.5 * (b - c) + 0.5 * (d - a)
-    return b + u * (one + u * (two + u * three)), one + u * (2.0 * two + u * 3.0 * three)
-
-
-@njit(**BORROWING)
 def locate(z, low, spacing, count, weight, slope):
     """Index of the first of four grid values for z; derivatives by z, zero beyond the ends."""
     first, u, inside = place((z - low) / spacing, count)

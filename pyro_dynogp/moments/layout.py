@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from pyro_dynogp.moments.measured_function import bench
+from pyro_dynogp.moments.nodes import bench
 from pyro_dynogp.support.compiled import OPTIONS
 
 # Added to the variance of a layer's input: a deterministic one is a Gaussian of this variance.
@@ -92,7 +92,7 @@ class Workspace(NamedTuple):
         W_bar, centre_bar, root_bar, cross_bar, f_bar: gradients, of one layer at a time.
         z, z_bar: (d,) a node, and the gradient by it.
         weight4, slope4: (4,) of a table's interpolation.
-        curve, at, weights, curve_bar, at_bar: of `measured_function`.
+        curve, place, corner, at, weights, inverses, curve_bar, lanes: of `measured_function`.
     """
 
     W: np.ndarray
@@ -112,10 +112,13 @@ class Workspace(NamedTuple):
     weight4: np.ndarray
     slope4: np.ndarray
     curve: np.ndarray
+    place: np.ndarray
+    corner: np.ndarray
     at: np.ndarray
     weights: np.ndarray
+    inverses: np.ndarray
     curve_bar: np.ndarray
-    at_bar: np.ndarray
+    lanes: np.ndarray
 
 
 @njit(**OPTIONS)
@@ -126,7 +129,7 @@ def workspace(layout, values):
     e = 1
     for i in range(S):
         e = max(e, layout.outputs[i])
-    curve, at, weights, curve_bar, at_bar = bench(layout.share.shape[0])
+    curve, place, corner, at, weights, inverses, curve_bar, lanes = bench(layout.share.shape[0])
     return Workspace(
         np.zeros((S, A, d)),
         np.zeros((S, d)),
@@ -145,10 +148,13 @@ def workspace(layout, values):
         np.empty(4),
         np.empty(4),
         curve,
+        place,
+        corner,
         at,
         weights,
+        inverses,
         curve_bar,
-        at_bar,
+        lanes,
     )
 
 

@@ -16,6 +16,9 @@ three nodes, which are the component's own and the second neighbours. That is ex
 and good for others however small R is: no node has to meet the peak of the likelihood.
 
 The noise is a mixture of Gaussians, as in `noise`. v is the function's own variance.
+
+Eight nodes are computed together, see `lti.lanes`: only the look-up in the table and the sums of
+gradients by its entries go node by node.
 """
 
 from __future__ import annotations
@@ -25,138 +28,109 @@ import math
 import numpy as np
 from numba import njit
 
-from pyro_dynogp.moments.functions import cubic, cubic_weights, place
-from pyro_dynogp.support.compiled import BORROWING, OPTIONS
+from pyro_dynogp.lti.lanes import WIDTH, choose, exponential, get, larger, put, root, splat, total
+from pyro_dynogp.moments.nodes import (
+    COUNT,
+    LOG_WEIGHTS,
+    MORE,
+    NODES,
+    OUTER,
+    ROOM,
+    SPACING,
+    SQUARE,
+    STANDARD,
+    VECTORS,
+    WIDE,
+    corner_bars,
+    cubic,
+    locate,
+    take,
+)
+from pyro_dynogp.support.compiled import BORROWING, WITHIN
 
-# The sum reproduces a Gaussian's density to 1e-7 up to five standard deviations. With this SPREAD
-# the nodes sqrt(3) SPREAD beside a component's are the second neighbours.
-SPACING, REACH = 0.2, 33
-SPREAD = 2.0 * SPACING / math.sqrt(3.0)
-# Logarithm of the least weight beside the largest: less would be lost in rounding.
-_LEAST = -40.0
-NODES = SPACING * np.arange(-REACH, REACH + 1.0)
-COUNT = len(NODES)
-_SQUARE = SPREAD * SPREAD
-
-
-def _log_weights(variance: float) -> np.ndarray:
-    """Of a normal distribution's values at the nodes, adding up to one."""
-    density = -0.5 * NODES**2 / variance
-    return density - np.log(np.exp(density).sum())
-
-
-# Of the components, and of the standard normal distribution itself.
-LOG_WEIGHTS = _log_weights(1.0 - _SQUARE)
-STANDARD = np.exp(_log_weights(1.0))
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
-@njit(**OPTIONS)
-def bench(components):
-    """Work arrays of the following functions.
-
-    Returns:
-        (COUNT + 4,) the function at all nodes and two more on either side; (3, COUNT) mean,
-        variance beside the line, and slope by xi of each component; (COUNT, components) weights;
-        gradients by the first two.
-    """
-    return (
-        np.empty(COUNT + 4),
-        np.empty((3, COUNT)),
-        np.empty((COUNT, components)),
-        np.empty(COUNT + 4),
-        np.empty((3, COUNT)),
-    )
-
-
-@njit(**BORROWING)
-def _ruler(i, values, centre, root):
-    """First node and distance of nodes in spacings of the table's grid, from its first point."""
-    scale = 1.0 / values.spacing[i]
-    stride = root * SPACING * scale
-    return (centre - values.low[i]) * scale - stride * (REACH + 2), stride
-
-
-@njit(**BORROWING)
-def _evaluate(i, layout, values, centre, root, work):
-    """Static layer i at the nodes centre + root xi, and each component's regression line."""
+@njit(**WITHIN)
+def _evaluate(i, layout, values, centre, sd, work):
+    """Static layer i at the nodes centre + sd xi, and each component's regression line."""
     mean = values.table_mean[layout.f_start[i]]
     variance = values.table_variance[layout.f_start[i]]
-    f, at = work.curve, work.at
-    start, stride = _ruler(i, values, centre, root)
-    for j in range(COUNT + 4):
-        k, u, _ = place(start + stride * j, mean.shape[0])
-        f[j] = cubic(mean, k, u)[0]
-        if 2 <= j < COUNT + 2:
-            at[1, j - 2] = max(cubic(variance, k, u)[0], 0.0)
-    for q in range(COUNT):
-        bend = f[q] - 2.0 * f[q + 2] + f[q + 4]
-        at[0, q] = f[q + 2] + bend / 6.0
-        at[1, q] += bend * bend / 18.0
-        at[2, q] = (f[q + 4] - f[q]) / (4.0 * SPACING)
+    f, place, at, corner = work.curve, work.place, work.at, work.corner
+    locate(values.low[i], values.spacing[i], mean.shape[0], centre, sd, place)
+    take(mean, variance, place, corner)
+    for v in range(MORE):
+        value, _ = cubic(corner, v, get(place, MORE + v))
+        put(f, v, value)
+    middle, last, share = f[2:], f[4:], place[1, 2:]
+    for v in range(VECTORS):
+        own, _ = cubic(corner, 4 * MORE + v, get(share, v))
+        a = get(f, v)
+        b = get(middle, v)
+        c = get(last, v)
+        bend = a - splat(2.0) * b + c
+        put(at, v, b + bend * splat(1.0 / 6.0))
+        put(at, VECTORS + v, larger(own, splat(0.0)) + bend * bend * splat(1.0 / 18.0))
+        put(at, 2 * VECTORS + v, (c - a) * splat(0.25 / SPACING))
 
 
 @njit(**BORROWING)
-def _weigh(y, R, share, multiple, at, weights):
-    """Turn log weights of all components into weights given y; the log of their sum."""
-    top = -np.inf
-    K = share.shape[0]
-    for k in range(K):
-        log_share = math.log(share[k])
-        for q in range(COUNT):
-            r = y - at[0, q]
-            S = at[2, q] * at[2, q] * _SQUARE + at[1, q] + R * multiple[k]
-            t = LOG_WEIGHTS[q] + log_share - 0.5 * r * r / S
-            weights[q, k] = t
-            top = max(top, t)
-    total = 0.0
-    for q in range(COUNT):
-        for k in range(K):
-            t = weights[q, k] - top
-            if t > _LEAST:
-                S = at[2, q] * at[2, q] * _SQUARE + at[1, q] + R * multiple[k]
-                weights[q, k] = math.exp(t) / math.sqrt(S)
-                total += weights[q, k]
-            else:
-                weights[q, k] = 0.0
-    scale = 1.0 / total
-    for q in range(COUNT):
-        for k in range(K):
-            weights[q, k] *= scale
-    return top + math.log(total)
+def _given_output(v, y, inverse, at):
+    """Components of vector v given y: regression of xi on y, mean and variance of xi.
 
-
-@njit(**BORROWING)
-def _given_output(q, y, noise, at):
-    """Component q given y: inverse variance of y, regression of xi on y, mean and variance of xi.
-
-    noise: variance of the measurement noise.
+    inverse: of the variance of y.
     """
-    slope = at[2, q]
-    inverse = 1.0 / (slope * slope * _SQUARE + at[1, q] + noise)
-    along = _SQUARE * slope * inverse
-    return inverse, along, NODES[q] + along * (y - at[0, q]), _SQUARE * (1.0 - along * slope)
+    slope = get(at, 2 * VECTORS + v)
+    along = splat(SQUARE) * slope * inverse
+    first = get(NODES, v) + along * (splat(y) - get(at, v))
+    return along, first, splat(SQUARE) * (splat(1.0) - along * slope)
 
 
-@njit(**BORROWING)
-def _moments(y, R, multiple, at, weights):
-    """Mean and variance of xi given y."""
-    K = multiple.shape[0]
-    mean = 0.0
-    second = 0.0
-    for q in range(COUNT):
-        for k in range(K):
-            weight = weights[q, k]
-            if weight > 0.0:
-                _, _, first, spread = _given_output(q, y, R * multiple[k], at)
-                mean += weight * first
-                second += weight * (spread + first * first)
+@njit(**WITHIN)
+def _weigh(y, R, share, multiple, work):
+    """Weights of all components given y, which `scale` makes add up to one.
+
+    Returns:
+        Logarithm of the density of y beside that of a constant, scale, mean and variance of xi.
+    """
+    at, weights, inverses = work.at, work.weights, work.inverses
+    most = splat(-np.inf)
+    for k in range(share.shape[0]):
+        level = splat(math.log(share[k]))
+        noise = splat(R * multiple[k])
+        for v in range(VECTORS):
+            r = splat(y) - get(at, v)
+            slope = get(at, 2 * VECTORS + v)
+            S = slope * slope * splat(SQUARE) + get(at, VECTORS + v) + noise
+            t = get(LOG_WEIGHTS, v) + level - splat(0.5) * r * r / S
+            put(inverses, k * VECTORS + v, splat(1.0) / S)
+            put(weights, k * VECTORS + v, t)
+            most = larger(t, most)
+    put(work.lanes, 0, most)
+    top = -np.inf
+    for b in range(WIDTH):
+        top = max(top, work.lanes[b])
+    weighed = splat(0.0)
+    mean = splat(0.0)
+    second = splat(0.0)
+    for k in range(share.shape[0]):
+        for v in range(VECTORS):
+            inverse = get(inverses, k * VECTORS + v)
+            weight = exponential(get(weights, k * VECTORS + v) - splat(top)) * root(inverse)
+            _, first, spread = _given_output(v, y, inverse, at)
+            put(weights, k * VECTORS + v, weight)
+            weighed = weighed + weight
+            mean = mean + weight * first
+            second = second + weight * (spread + first * first)
+    whole = total(weighed)
+    scale = 1.0 / whole
+    average = scale * total(mean)
     # No variance is lost in rounding that matters: 1 - variance is what counts.
-    variance = second - mean * mean
-    return mean, variance
+    variance = scale * total(second) - average * average
+    return top + math.log(whole) - _HALF_LOG_2PI, scale, average, variance
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def function_terms(i, y, R, centre, p, layout, values, work):
     """Value l, alpha = dl/dc and beta = -d^2 l/dc^2 of the log-density of y = f(g) + e.
 
@@ -168,119 +142,136 @@ def function_terms(i, y, R, centre, p, layout, values, work):
     return function_given(y, R, p, layout, work)
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def function_adjoint(i, y, R, centre, p, layout, values, bars, work, alpha_bar, beta_bar):
     """Reverse of `function_terms` where l counts once: adds to bars of the function.
 
     Returns:
         Gradients by y, R, centre and p.
     """
-    root = math.sqrt(p)
-    _evaluate(i, layout, values, centre, root, work)
-    at, weights = work.at, work.weights
-    _weigh(y, R, layout.share, layout.multiple, at, weights)
-    mean, variance = _moments(y, R, layout.multiple, at, weights)
+    sd = math.sqrt(p)
+    _evaluate(i, layout, values, centre, sd, work)
+    _, scale, mean, variance = _weigh(y, R, layout.share, layout.multiple, work)
     beta = (1.0 - variance) / p
     # variance = second - mean^2
     second_bar = -beta_bar / p
-    mean_bar = alpha_bar / root - 2.0 * mean * second_bar
-    p_bar = -0.5 * alpha_bar * mean / (p * root) - beta_bar * beta / p
-    R_bar = 0.0
-    y_bar = 0.0
-    work.at_bar[:] = 0.0
-    f_bar, v_bar, slope_bar = work.at_bar[0], work.at_bar[1], work.at_bar[2]
-    K = layout.multiple.shape[0]
-    level = mean_bar * mean + second_bar * (variance + mean * mean)  # what weights have in common
-    for q in range(COUNT):
-        r = y - at[0, q]
-        s = at[2, q]
-        for k in range(K):
-            weight = weights[q, k]
-            if weight == 0.0:
-                continue
-            inverse, along, first, spread = _given_output(q, y, R * layout.multiple[k], at)
-            term_bar = weight * (
-                1.0 + mean_bar * first + second_bar * (spread + first * first) - level
-            )
-            first_bar = weight * (mean_bar + 2.0 * second_bar * first)
-            spread_bar = weight * second_bar
-            along_bar = first_bar * r - spread_bar * _SQUARE * s
-            S_bar = (0.5 * term_bar * (r * r * inverse - 1.0) - along_bar * along) * inverse
+    mean_bar = alpha_bar / sd - 2.0 * mean * second_bar
+    p_bar = -0.5 * alpha_bar * mean / (p * sd) - beta_bar * beta / p
+    # What the weights have in common goes with their sum.
+    level = 1.0 - mean_bar * mean - second_bar * (variance + mean * mean)
+    y_bar, R_bar = _weigh_adjoint(y, layout.multiple, scale, mean_bar, second_bar, level, work)
+    centre_bar, sd_bar = _evaluate_adjoint(i, layout, values, bars, centre, sd, work)
+    return y_bar, R_bar, centre_bar, p_bar + 0.5 * sd_bar / sd
+
+
+@njit(**WITHIN)
+def _weigh_adjoint(y, multiple, scale, mean_bar, second_bar, level, work):
+    """Write the gradients by function and variance; gradients by y and R are returned."""
+    at, bars = work.at, work.curve_bar
+    early, middle, late = bars[0, 4:], bars[1, 4:], bars[2, 4:]
+    f, f2, f4 = work.curve, work.curve[2:], work.curve[4:]
+    square = splat(SQUARE)
+    two = splat(2.0)
+    half = splat(0.5)
+    first_order = splat(mean_bar)
+    second_order = splat(second_bar)
+    y_bar = splat(0.0)
+    R_bar = splat(0.0)
+    for v in range(VECTORS):
+        r = splat(y) - get(at, v)
+        s = get(at, 2 * VECTORS + v)
+        f_bar = splat(0.0)
+        v_bar = splat(0.0)
+        slope_bar = splat(0.0)
+        for k in range(multiple.shape[0]):
+            inverse = get(work.inverses, k * VECTORS + v)
+            weight = splat(scale) * get(work.weights, k * VECTORS + v)
+            along, first, spread = _given_output(v, y, inverse, at)
+            term = first_order * first + second_order * (spread + first * first) + splat(level)
+            term_bar = weight * term
+            first_bar = weight * (first_order + two * second_order * first)
+            spread_bar = weight * second_order
+            along_bar = first_bar * r - spread_bar * square * s
+            gained = half * term_bar * (r * r * inverse - splat(1.0))
+            S_bar = (gained - along_bar * along) * inverse
             r_bar = first_bar * along - term_bar * r * inverse
-            slope_bar[q] += _SQUARE * (along_bar * inverse - spread_bar * along + 2.0 * S_bar * s)
-            v_bar[q] += S_bar
-            R_bar += S_bar * layout.multiple[k]
-            f_bar[q] -= r_bar
-            y_bar += r_bar
-    centre_bar, root_bar = _evaluate_adjoint(i, layout, values, bars, centre, root, work)
-    return y_bar, R_bar, centre_bar, p_bar + 0.5 * root_bar / root
+            slope_bar = slope_bar + square * (
+                along_bar * inverse - spread_bar * along + two * S_bar * s
+            )
+            v_bar = v_bar + S_bar
+            R_bar = R_bar + S_bar * splat(multiple[k])
+            f_bar = f_bar - r_bar
+        y_bar = y_bar - f_bar
+        bend = get(f, v) - two * get(f2, v) + get(f4, v)
+        bend_bar = f_bar * splat(1.0 / 6.0) + v_bar * bend * splat(1.0 / 9.0)
+        slope = slope_bar * splat(0.25 / SPACING)
+        put(early, v, bend_bar - slope)
+        put(middle, v, f_bar - two * bend_bar)
+        put(late, v, bend_bar + slope)
+        put(bars[3], v, v_bar)
+    return total(y_bar), total(R_bar)
 
 
-@njit(**BORROWING)
-def _evaluate_adjoint(i, layout, values, bars, centre, root, work):
-    """Reverse of `_evaluate`, of work.at_bar: adds to bars; gradients by centre and root."""
-    f, curve_bar, w4, s4 = work.curve, work.curve_bar, work.weight4, work.slope4
-    f_bar, v_bar, slope_bar = work.at_bar[0], work.at_bar[1], work.at_bar[2]
-    curve_bar[:] = 0.0
-    for q in range(COUNT):
-        bend = f[q] - 2.0 * f[q + 2] + f[q + 4]
-        bend_bar = f_bar[q] / 6.0 + v_bar[q] * bend / 9.0
-        slope = slope_bar[q] / (4.0 * SPACING)
-        curve_bar[q] += bend_bar - slope
-        curve_bar[q + 2] += f_bar[q] - 2.0 * bend_bar
-        curve_bar[q + 4] += bend_bar + slope
-    centre_bar = 0.0
-    mean_row = values.table_mean[layout.f_start[i]]
-    variance_row = values.table_variance[layout.f_start[i]]
+@njit(**WITHIN)
+def _evaluate_adjoint(i, layout, values, bars, centre, sd, work):
+    """Reverse of `_evaluate`: adds to bars; gradients by centre and sd."""
+    place, corner = work.place, work.corner
+    # The function at a node is in the lines of its own component and of its second neighbours.
+    early, middle, late = work.curve_bar[0, 4:], work.curve_bar[1, 2:], work.curve_bar[2]
+    own, share, inside, outer = work.curve_bar[3], place[1, 2:], place[2, 2:], OUTER[2:]
+    centre_bar = splat(0.0)
+    sd_bar = splat(0.0)
+    for v in range(MORE):
+        u = get(place, MORE + v)
+        bar = get(early, v) + get(middle, v) + get(late, v)
+        _, slope = cubic(corner, v, u)
+        z_bar = bar * slope * get(place, 2 * MORE + v)
+        centre_bar = centre_bar + z_bar
+        sd_bar = sd_bar + z_bar * get(OUTER, v)
+        corner_bars(corner, v, u, bar)
+    for v in range(VECTORS):
+        u = get(share, v)
+        variance, slope = cubic(corner, 4 * MORE + v, u)
+        # Where a negative one was cut off there is no gradient.
+        bar = choose(variance, get(own, v), splat(0.0))
+        z_bar = bar * slope * get(inside, v)
+        centre_bar = centre_bar + z_bar
+        sd_bar = sd_bar + z_bar * get(outer, v)
+        corner_bars(corner, 4 * MORE + v, u, bar)
     mean_bars = bars.table_mean[layout.f_start[i]]
     variance_bars = bars.table_variance[layout.f_start[i]]
-    start, stride = _ruler(i, values, centre, root)
-    scale = 1.0 / values.spacing[i]
-    spacing_bar = 0.0
-    root_bar = 0.0
-    for j in range(COUNT + 4):
-        own_bar = v_bar[j - 2] if 2 <= j < COUNT + 2 else 0.0
-        if curve_bar[j] == 0.0 and own_bar == 0.0:
-            continue  # no component near by has any weight
-        t = start + stride * j
-        k, u, inside = place(t, mean_row.shape[0])
-        _, slope = cubic(mean_row, k, u)
-        t_bar = curve_bar[j] * slope
-        cubic_weights(u, w4, s4)
+    for j in range(WIDE):
+        k = int(place[0, j])
         for b in range(4):
-            mean_bars[k + b] += curve_bar[j] * w4[b]
-        variance, slope = cubic(variance_row, k, u)
-        if variance > 0.0:  # where a negative one was cut off there is no gradient
-            t_bar += own_bar * slope
-            for b in range(4):
-                variance_bars[k + b] += own_bar * w4[b]
-        # t = (centre + root xi - low) / spacing; the grid itself may move.
-        z_bar = t_bar * inside * scale
-        centre_bar += z_bar
-        spacing_bar -= z_bar * t
-        root_bar += z_bar * SPACING * (j - REACH - 2)
-    bars.low[i] -= centre_bar
-    bars.spacing[i] += spacing_bar
-    return centre_bar, root_bar
+            mean_bars[k + b] += corner[b, j]
+    for j in range(ROOM):
+        k = int(place[0, j + 2])
+        for b in range(4):
+            variance_bars[k + b] += corner[4 + b, j]
+    # Places on the grid are (centre + sd xi - low) / spacing; the grid itself may move.
+    scale = 1.0 / values.spacing[i]
+    by_centre = scale * total(centre_bar)
+    by_sd = scale * total(sd_bar)
+    bars.low[i] -= by_centre
+    bars.spacing[i] -= scale * (by_centre * (centre - values.low[i]) + by_sd * sd)
+    return by_centre, by_sd
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def function_given(y, R, p, layout, work):
     """What `function_terms` returns, at the c and p of the last `function_moments`."""
-    root = math.sqrt(p)
-    at, weights = work.at, work.weights
-    l = _weigh(y, R, layout.share, layout.multiple, at, weights)
-    mean, variance = _moments(y, R, layout.multiple, at, weights)
-    return l - _HALF_LOG_2PI, mean / root, (1.0 - variance) / p
+    l, _, mean, variance = _weigh(y, R, layout.share, layout.multiple, work)
+    return l, mean / math.sqrt(p), (1.0 - variance) / p
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def function_density(y, R, layout, work):
     """Its value l alone."""
-    return _weigh(y, R, layout.share, layout.multiple, work.at, work.weights) - _HALF_LOG_2PI
+    l, _, _, _ = _weigh(y, R, layout.share, layout.multiple, work)
+    return l
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def function_moments(i, centre, p, layout, values, work):
     """Mean and variance of f(g) for g ~ N(centre, p)."""
     _evaluate(i, layout, values, centre, math.sqrt(p), work)

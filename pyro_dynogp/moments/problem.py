@@ -6,6 +6,7 @@ import multiprocessing
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from typing import Any
 
 import joblib
@@ -137,6 +138,12 @@ def make_layout(
     )
 
 
+@lru_cache
+def _processors() -> int:
+    """Asked once: the answer is in files that take longer to read than a short record to filter."""
+    return int(joblib.cpu_count())
+
+
 def each(function: Callable[[int], Any], count: int) -> list[Any]:
     """Apply to 0..count-1, on threads: the compiled code holds no lock.
 
@@ -144,11 +151,18 @@ def each(function: Callable[[int], Any], count: int) -> list[Any]:
     Elements do not meet, so that the numbers do not depend on the number of threads.
     """
     alone = multiprocessing.parent_process() is None
-    threads = min(count, joblib.cpu_count() if alone else 1)
+    threads = min(count, _processors() if alone else 1)
     if threads <= 1:
         return [function(b) for b in range(count)]
-    with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(function, range(count)))
+    parts = [range(first, count, threads) for first in range(threads)]
+
+    def work(part: range) -> list[Any]:
+        return [function(b) for b in part]
+
+    with ThreadPoolExecutor(threads - 1) as pool:
+        others = [pool.submit(work, part) for part in parts[1:]]
+        found = [work(parts[0]), *(other.result() for other in others)]
+    return [found[b % threads][b // threads] for b in range(count)]
 
 
 class _Filter(torch.autograd.Function):
@@ -159,15 +173,14 @@ class _Filter(torch.autograd.Function):
         results = each(lambda b: filtering.run(layout, elements[b]), len(elements))
         ctx.layout = layout
         ctx.elements = elements
-        ctx.starts = [(r[1], r[2]) for r in results]
+        ctx.tracks = [r[1] for r in results]
         return torch.tensor([r[0] for r in results], dtype=torch.float64, device=args[0].device)
 
     @staticmethod
     def backward(ctx: Any, *bars: Tensor) -> Any:
         def gradient(b: int) -> Values:
             out = zero_bars(ctx.elements[b])
-            means, covariances = ctx.starts[b]
-            return reverse.run_adjoint(ctx.layout, ctx.elements[b], out, means, covariances)
+            return reverse.run_adjoint(ctx.layout, ctx.elements[b], out, ctx.tracks[b])
 
         scale = array(bars[0])
         gradients = each(gradient, len(ctx.elements))

@@ -18,14 +18,14 @@ from pyro_dynogp.moments.noise import noise_adjoint
 from pyro_dynogp.moments.segments import replay, restore, room
 from pyro_dynogp.moments.state import move_adjoint, update
 from pyro_dynogp.moments.static_layer import append_adjoint
-from pyro_dynogp.support.compiled import BORROWING, OPTIONS
+from pyro_dynogp.support.compiled import OPTIONS, WITHIN
 
 
-@njit(**BORROWING)
-def _measure_adjoint(time, k, layout, values, bars, m, P, m_bar, P_bar, c_bar, work, kept):
+@njit(**WITHIN)
+def _measure_adjoint(time, track, layout, values, bars, m, P, m_bar, P_bar, c_bar, work, kept):
     """Reverse of `measure`: m and P go back to what they were, bars change in place."""
     A = m.shape[0]
-    alphas, betas = kept.alphas[k], kept.betas[k]
+    alphas, betas = track.alphas[time], track.betas[time]
     for o in range(values.y.shape[1] - 1, -1, -1):
         if math.isnan(values.y[time, o]):
             continue
@@ -78,7 +78,7 @@ def _measure_adjoint(time, k, layout, values, bars, m, P, m_bar, P_bar, c_bar, w
 
 
 @njit(**OPTIONS)
-def run_adjoint(layout, values, bars, means, covariances):
+def run_adjoint(layout, values, bars, track):
     """Gradient of the log-density that `run` returns, added to bars."""
     n = layout.step.shape[0]
     N = values.m0.shape[0]
@@ -93,20 +93,20 @@ def run_adjoint(layout, values, bars, means, covariances):
     T_bar = np.empty((N, A))
     c_bar = np.empty(A)
     kept = room(values, A)
-    for segment in range(means.shape[0] - 1, -1, -1):
+    for segment in range(track.means.shape[0] - 1, -1, -1):
         first = segment * SEGMENT
         last = min(n, first + SEGMENT)
-        m[:N] = means[segment]
-        P[:N, :N] = covariances[segment]
-        replay(first, last, S, layout, values, m, P, T, c_bar, work, kept)
+        m[:N] = track.means[segment]
+        P[:N, :N] = track.covariances[segment]
+        replay(first, last, S, track, layout, values, m, P, T, c_bar, work, kept)
         for time in range(last - 1, first - 1, -1):
-            restore(time, time - first, time == last - 1, S, layout, values, m, P, work, kept)
+            restore(time, time - first, S, track, layout, values, m, P, work, kept)
             if time < n - 1:
                 k = layout.step[time + 1]
                 if k >= 0:
                     move_adjoint(k, layout, values, bars, m, P, m_bar, P_bar, T, T_bar)
             _measure_adjoint(
-                time, time - first, layout, values, bars, m, P, m_bar, P_bar, c_bar, work, kept
+                time, track, layout, values, bars, m, P, m_bar, P_bar, c_bar, work, kept
             )
             for i in range(S - 1, -1, -1):
                 append_adjoint(i, time, layout, values, bars, m, P, m_bar, P_bar, work)

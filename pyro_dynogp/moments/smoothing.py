@@ -120,7 +120,7 @@ def predict_ahead(layout, values, horizon):
 
 
 @njit(**BORROWING)
-def _before_outputs(time, k, layout, values, bar, L, m, P, t, work, kept, cavity):
+def _before_outputs(time, track, layout, values, bar, L, m, P, t, work, kept, cavity):
     """Take lambda (A,) and Lambda (A, A) back over the outputs of a sample, undone in m and P.
 
     Writes to cavity (3, n, n_y) mean and variance of each noise-free output given all data but its
@@ -130,7 +130,7 @@ def _before_outputs(time, k, layout, values, bar, L, m, P, t, work, kept, cavity
     s - q/(1 + beta q) before it.
     """
     A = bar.shape[0]
-    alphas, betas = kept.alphas[k], kept.betas[k]
+    alphas, betas = track.alphas[time], track.betas[time]
     for o in range(values.y.shape[1] - 1, -1, -1):
         if math.isnan(values.y[time, o]):
             continue
@@ -190,30 +190,30 @@ def _before_layer(i, layout, values, bar, L, work, row):
 
 
 @njit(**OPTIONS)
-def smooth(layout, values, rows, means, covariances):
+def smooth(layout, values, rows, track):
     """Smoothed mean (n, A) of [x; f] and variance (n, r) of the rows (r, A) of it.
 
-    means, covariances: what `filtering.run` kept at the segments.
+    track: what `filtering.run` kept.
     """
     cavity = np.empty((3, 0, values.y.shape[1]))
     S = layout.channels.shape[0]
-    return _backwards(layout, values, S, rows, means, covariances, cavity)
+    return _backwards(layout, values, S, rows, track, cavity)
 
 
 @njit(**OPTIONS)
-def leave_one_out(layout, values, means, covariances):
+def leave_one_out(layout, values, track):
     """What `predict_ahead` returns, of each output given all data but its own sample.
 
     NaN where the sample is missing. Exact for linear cascades with Gaussian noise.
     """
     rows = np.empty((0, width(layout, values)))
     cavity = np.full((3, values.y.shape[0], values.y.shape[1]), np.nan)
-    _backwards(layout, values, inner(layout), rows, means, covariances, cavity)
+    _backwards(layout, values, inner(layout), rows, track, cavity)
     return cavity[0], cavity[1], cavity[2]
 
 
 @njit(**OPTIONS)
-def _backwards(layout, values, S, rows, means, covariances, cavity):
+def _backwards(layout, values, S, rows, track, cavity):
     """What `smooth` returns; writes what `leave_one_out` does to cavity, unless that is empty.
 
     S: how many static layers are appended. rows: (r, A) of the state and these.
@@ -233,14 +233,14 @@ def _backwards(layout, values, S, rows, means, covariances, cavity):
     c = np.empty(A)
     t = np.empty(A)
     kept = room(values, A)
-    for segment in range(means.shape[0] - 1, -1, -1):
+    for segment in range(track.means.shape[0] - 1, -1, -1):
         first = segment * SEGMENT
         last = min(n, first + SEGMENT)
-        m[:N] = means[segment]
-        P[:N, :N] = covariances[segment]
-        replay(first, last, S, layout, values, m, P, T, c, work, kept)
+        m[:N] = track.means[segment]
+        P[:N, :N] = track.covariances[segment]
+        replay(first, last, S, track, layout, values, m, P, T, c, work, kept)
         for time in range(last - 1, first - 1, -1):
-            restore(time, time - first, time == last - 1, S, layout, values, m, P, work, kept)
+            restore(time, time - first, S, track, layout, values, m, P, work, kept)
             if time < n - 1 and layout.step[time + 1] >= 0:
                 k = layout.step[time + 1]
                 step_back(values.re[k], values.im[k], values.gamma[k], bar, L, moved)
@@ -250,7 +250,7 @@ def _backwards(layout, values, S, rows, means, covariances, cavity):
             for row in range(rows.shape[0]):
                 times(P, rows[row], c)
                 variance[time, row] = max(dot(rows[row], c) - _quadratic(L, c, t), 0.0)
-            _before_outputs(time, time - first, layout, values, bar, L, m, P, t, work, kept, cavity)
+            _before_outputs(time, track, layout, values, bar, L, m, P, t, work, kept, cavity)
             for i in range(S - 1, -1, -1):
                 _before_layer(i, layout, values, bar, L, work, t)
     return mean, variance

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from numba import njit
 
-from pyro_dynogp.support.compiled import BORROWING
+from pyro_dynogp.support.compiled import BORROWING, WITHIN
 
 
 @njit(**BORROWING)
@@ -118,7 +118,7 @@ def move(re, im, gamma, Q, m, P, T):
                 P[i, j] += T[i, N + f] * gamma[j, f]
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def move_adjoint(k, layout, values, bars, m, P, m_bar, P_bar, T, T_bar):
     """Reverse of `move` over step k: m, P are those before it; the bars change in place."""
     re = values.re[k]

@@ -24,7 +24,7 @@ from pyro_dynogp.moments.functions import (
     locate,
 )
 from pyro_dynogp.moments.layout import FLOOR
-from pyro_dynogp.support.compiled import BORROWING, INLINED
+from pyro_dynogp.support.compiled import BORROWING, INLINED, WITHIN
 
 
 @njit(**BORROWING)
@@ -80,7 +80,7 @@ def expansion_of(i, layout, numbers):
     )
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def _project(i, time, layout, values, m, P, work):
     """Mean of g, its covariance W with a, and the root of its own: all to the work arrays."""
     d = layout.channels[i]
@@ -108,7 +108,7 @@ def _project(i, time, layout, values, m, P, work):
     _cholesky(p[:d, :d], work.root[i, :d, :d])
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def _node(i, q, layout, work):
     """Write node q of layer i, centre + L xi_q, to work.z."""
     xi, z = layout.nodes[i, q], work.z
@@ -118,7 +118,7 @@ def _node(i, q, layout, work):
             z[c] += work.root[i, c, b] * xi[b]
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def _average(i, layout, values, mean, block, work):
     """Write E f, Var f and work.cross = sum w xi f' of static layer i."""
     d = layout.channels[i]
@@ -162,7 +162,7 @@ def _average(i, layout, values, mean, block, work):
                 block[a, b] += wq * (f[a] - mean[a]) * (f[b] - mean[b])
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def append(i, time, layout, values, m, P, work):
     """Append the outputs of static layer i to the mean m and covariance P, in place."""
     d = layout.channels[i]
@@ -186,7 +186,7 @@ def append(i, time, layout, values, m, P, work):
             P[na + a, k] = total
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def _gain_adjoint(i, na, layout, P_bar, work):
     """Gradients by cross, W and root through the regression gain; the others begin at zero."""
     d = layout.channels[i]
@@ -216,7 +216,7 @@ def _gain_adjoint(i, na, layout, P_bar, work):
                 root_bar[j, k] -= gain[j, a] * cross_bar[k, a]
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def _average_adjoint(i, layout, values, bars, m, m_bar, P_bar, work):
     """Reverse of `_average`: gradients by the function, and by centre and root of its input."""
     d = layout.channels[i]
@@ -262,7 +262,7 @@ def _average_adjoint(i, layout, values, bars, m, m_bar, P_bar, work):
                 work.root_bar[c, b] += z_bar[c] * xi[b]
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def append_adjoint(i, time, layout, values, bars, m, P, m_bar, P_bar, work):
     """Reverse mode of `append`: m_bar and P_bar (symmetric) lose the layer's outputs, in place."""
     d = layout.channels[i]

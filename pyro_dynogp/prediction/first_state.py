@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from scipy.optimize import minimize
 from torch import Tensor
 
+from pyro_dynogp.inference.optimise.descent import newton
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.models.system import System
@@ -72,19 +72,17 @@ def estimate(fit: Fitted, record: PreparedRecord) -> dict[str, Tensor]:
         return {}
 
     def split(z: Tensor) -> dict[str, Tensor]:
-        return dict(zip(sizes, torch.split(z, list(sizes.values())), strict=True))
+        return dict(zip(sizes, torch.split(z, list(sizes.values()), -1), strict=True))
 
-    def energy(x: np.ndarray) -> tuple[float, np.ndarray]:
+    def energies(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         with torch.enable_grad():  # predictions are made without
             z = torch.tensor(x, requires_grad=True)
             outputs = output_process(model.begin(system, split(z)), head)
-            value = 0.5 * z.square().sum() - outputs.log_prob(head.observations)
-            (gradient,) = torch.autograd.grad(value, z)
-        return float(value.detach()), gradient.numpy()
+            value = 0.5 * z.square().sum(-1) - outputs.log_prob(head.observations)
+            (gradient,) = torch.autograd.grad(value.sum(), z)
+        return value.detach().numpy(), gradient.numpy()
 
     generator = np.random.default_rng(0)
-    found = []
-    for start in (np.zeros(total), *(0.5 * generator.standard_normal((2, total)))):
-        found.append(minimize(energy, start, jac=True, method="L-BFGS-B", options={"maxiter": 60}))
-    best = min(found, key=lambda result: float(result.fun))
-    return {name: z.detach() for name, z in split(torch.tensor(best.x)).items()}
+    starts = np.concatenate([np.zeros((1, total)), 0.5 * generator.standard_normal((2, total))])
+    found, values = newton(energies, starts)
+    return split(torch.tensor(found[values.argmin()]))

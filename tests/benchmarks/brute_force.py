@@ -163,8 +163,8 @@ def _smoothed(observed: Any, y: torch.Tensor) -> tuple[np.ndarray, np.ndarray, n
 
     def moments(b: int) -> np.ndarray:
         one = elements[b]
-        _, means, covariances, _, _ = filtering.run(layout, one)
-        mean, variance, _ = smoothing.leave_one_out(layout, one, means, covariances)
+        _, track, _, _ = filtering.run(layout, one)
+        mean, variance, _ = smoothing.leave_one_out(layout, one, track)
         gain = variance / (variance + one.R)
         return np.stack([mean + gain * (one.y - mean), (1.0 - gain) * variance, one.R + 0.0 * mean])
 

@@ -6,7 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import rosen, rosen_der, rosen_hess
 
-from pyro_dynogp.inference.optimise.descent import FLAT, LEAST, bounded_root, descend, hessian
+from pyro_dynogp.inference.optimise.descent import (
+    FLAT,
+    LEAST,
+    bounded_root,
+    descend,
+    hessian,
+    newton,
+)
 
 
 def functions_of(value, gradient):
@@ -97,3 +104,35 @@ def test_bounded_root_of_a_definite_hessian_is_that_of_its_inverse():
     root = bounded_root(H)
     np.testing.assert_allclose(root @ root.T, np.linalg.inv(H), rtol=1e-9)
     np.testing.assert_array_equal(root, np.tril(root))
+
+
+def test_newton_finds_the_minima_of_a_double_well_to_rounding():
+    """f = (x^2 - 1)^2 + (y - x)^2 has minima at (1, 1) and (-1, -1) alone."""
+    calls = []
+
+    def functions(z):
+        calls.append(len(z))
+        x, y = z.T
+        value = (x**2 - 1.0) ** 2 + (y - x) ** 2
+        by_x = 4.0 * x * (x**2 - 1.0) - 2.0 * (y - x)
+        return value, np.stack([by_x, 2.0 * (y - x)], 1)
+
+    starts = np.array([[0.3, -0.5], [-2.0, 3.0], [1.0, 1.0]])
+    found, values = newton(functions, starts)
+    np.testing.assert_allclose(np.abs(found), 1.0, rtol=1e-8)
+    np.testing.assert_allclose(found[:, 0], found[:, 1], rtol=1e-8)
+    assert found[2, 0] == 1.0
+    assert values.max() < 1e-8
+    assert calls[0] == 9  # three points each of three starts
+    assert len(calls) < 30
+
+
+def test_newton_steps_back_from_where_there_is_no_value():
+    def functions(z):
+        with np.errstate(all="ignore"):
+            return (z - np.log(z)).sum(1), 1.0 - 1.0 / z
+
+    found, _ = newton(functions, np.array([[3.5], [0.01]]))
+    np.testing.assert_allclose(found, 1.0, rtol=1e-7)
+    _, values = newton(functions, np.array([[-1.0]]))
+    assert values[0] == np.inf

@@ -20,6 +20,7 @@ TWO = simulate_record(
 )
 GAPS = ONE.with_outputs(np.where(np.arange(40)[:, None] % 7 == 3, np.nan, ONE.outputs))
 LIMITED = ONE.with_outputs(np.clip(ONE.outputs, -0.3, 0.4))
+WIDE = dgp.Record(ONE.time, np.column_stack([ONE.inputs, np.sin(ONE.time)]), ONE.outputs)
 SENSOR = dgp.Static(inducing=5, limits=(-0.3, 0.4))
 UNEVEN = dgp.Record(ONE.time + 0.03 * np.sin(np.arange(40)), ONE.inputs, ONE.outputs)
 CASES = {
@@ -49,6 +50,9 @@ CASES = {
     "Hammerstein": (dgp.Hammerstein(1, pairs=1, inducing=5), GAPS),
     "Wiener-Hammerstein": (dgp.WienerHammerstein(1, pairs=1, inducing=5), ONE),
     "Hammerstein-Wiener": (dgp.HammersteinWiener(1, pairs=1, inducing=5), ONE),
+    "feedback": (dgp.NonlinearFeedback(1, pairs=1, inducing=5), ONE),
+    "Wiener, two inputs": (dgp.Wiener(2, pairs=1, inducing=5), WIDE),
+    "Wiener, two outputs": (dgp.Wiener(1, outputs=2, pairs=1, inducing=5), TWO),
     "two dynamic layers": (
         dgp.Cascade(1, (dgp.Dynamic(2, pairs=2), dgp.Dynamic(pairs=1, skip=("inputs",)))), ONE,
     ),
@@ -84,15 +88,44 @@ def test_equals_the_trace(name):
     for jacobian in (False, True):
         for at in (z[0], z):
             found = []
-            for log_joint in (direct, traced):
+            energies = (
+                lambda x: joint_energy(traced, potential.sites, x, jacobian=jacobian),  # noqa: B023
+                lambda x: joint_energy(direct, potential.sites, x, jacobian=jacobian),  # noqa: B023
+                # Priors, and of linear models all of it, as one vector.
+                lambda x: potential.energy(x, jacobian=jacobian),  # noqa: B023
+            )
+            for energy in energies:
                 x = at.clone().requires_grad_()
-                value = joint_energy(log_joint, potential.sites, x, jacobian=jacobian)
+                value = energy(x)
                 found.append((value.detach(), torch.autograd.grad(value.sum(), x)[0]))
-            (value, slope), (exact, gradient) = found
-            assert value.shape == exact.shape == at.shape[:-1]
-            torch.testing.assert_close(value, exact, rtol=1e-10, atol=1e-10)
+            (exact, gradient), *others = found
             size = float(gradient.abs().max())
-            torch.testing.assert_close(slope, gradient, rtol=1e-10, atol=1e-10 * size)
+            for (value, slope), rounding in zip(others, (1e-10, 1e-8), strict=True):
+                assert value.shape == exact.shape == at.shape[:-1]
+                torch.testing.assert_close(value, exact, rtol=1e-10, atol=1e-10)
+                torch.testing.assert_close(slope, gradient, rtol=rounding, atol=rounding * size)
+
+
+@pytest.mark.parametrize("name", ["Wiener", "quiet Wiener", "Hammerstein", "feedback"])
+def test_fixed_sites_are_those_of_a_conditioned_model(name):
+    target, args, points = prepared(name)
+    free = [site for site in points[0] if site.endswith(("_values", "_state"))]
+    fixed = {k: v for k, v in points[0].items() if k not in free}
+    rest = [{k: values[k] for k in free} for values in points]
+    conditioned = Traced(pyro.poutine.condition(target, data=fixed), args)
+    potential = Potential(target, args, rest[0], fixed)
+    assert isinstance(potential.log_density, Direct)
+    assert [site.name for site in potential.sites] == [
+        n for n, _, _ in conditioned.latent(rest[0])[0]
+    ]
+    z = torch.stack([potential.pack(values) for values in rest])
+    values, gradients = potential.with_jacobian(z.numpy())
+    for at, value, gradient in zip(z, values, gradients, strict=True):
+        x = at.clone().requires_grad_()
+        exact = joint_energy(conditioned, potential.sites, x, jacobian=True)
+        (slope,) = torch.autograd.grad(exact, x)
+        assert value == pytest.approx(exact.item(), rel=1e-10)
+        np.testing.assert_allclose(gradient, slope, rtol=1e-8, atol=1e-8 * float(slope.abs().max()))
 
 
 def test_other_functions_are_traced():

@@ -106,15 +106,15 @@ def the_record_of_the_files():
 def test_files_of_version_4_are_read(name, tmp_path):
     expected = json.loads((FILES / "version_4.json").read_text())[name]
     record = the_record_of_the_files()
+    # The filter of models with functions sums up its nodes in another order than version 4 did.
+    same = {"rtol": 1e-12 if name == "linear" else 1e-10}
     fit = dgp.load(FILES / f"{name}_version_4.safetensors")
     fit.save(tmp_path / "fit")
     for again in (fit, dgp.load(tmp_path / "fit")):
         found = again.forecast(record[:40], record[40:])
-        np.testing.assert_allclose(found.mean[:, 0], expected["mean"], rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(found.sd[:, 0], expected["sd"], rtol=1e-12)
-        np.testing.assert_allclose(
-            again.log_likelihood(record), expected["log_likelihood"], rtol=1e-12
-        )
+        np.testing.assert_allclose(found.mean[:, 0], expected["mean"], **same, atol=1e-12)
+        np.testing.assert_allclose(found.sd[:, 0], expected["sd"], **same)
+        np.testing.assert_allclose(again.log_likelihood(record), expected["log_likelihood"], **same)
         assert again.method == "svi"
         assert bool(again.posterior.points) == (name == "wiener")
         assert torch.isfinite(again.posterior.log_prob(again.draws)).all()

@@ -5,6 +5,7 @@ from numba import njit
 
 from pyro_dynogp.lti.lanes import (
     WIDTH,
+    below,
     choose,
     complex_exponential,
     get,
@@ -15,6 +16,7 @@ from pyro_dynogp.lti.lanes import (
     put,
     root,
     splat,
+    total,
 )
 
 
@@ -31,16 +33,20 @@ def _operations(x, y, out):
     put(out, 6, larger(a, b))
     put(out, 7, power_of_two(nearest(b)))
     put(out, 8, get(x, 1))
+    put(out, 9, below(b))
+    put(out, 10, splat(total(a)))
 
 
 def test_operations_are_those_of_numpy_to_the_bit():
     rng = np.random.default_rng(0)
     x, y = rng.standard_normal((2, WIDTH)), 10.0 * rng.standard_normal((1, WIDTH))
-    out = np.empty((9, WIDTH))
+    out = np.empty((11, WIDTH))
     _operations(x, y, out)
     a, b = x[0], y[0]
     expected = [a + b, a - b, a * b, a / b, np.sqrt(abs(a)), np.where(a > 0, b, 7.0)]
-    expected += [np.maximum(a, b), 2.0 ** np.rint(b), x[1]]
+    expected += [np.maximum(a, b), 2.0 ** np.rint(b), x[1], np.floor(b)]
+    pairs = a.reshape(4, 2).sum(1).reshape(2, 2).sum(1)
+    expected.append(np.full(WIDTH, pairs.sum()))
     np.testing.assert_array_equal(out, expected)
 
 

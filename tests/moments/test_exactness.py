@@ -121,8 +121,8 @@ def test_smoothed_signals(name, noise):
     layout, values = case.problem.layout, case.values
     signals = {k: s for k, s in case.assembly.signals.items() if s.rows is not None}
     rows = torch.cat([s.rows for s in signals.values()]).numpy().copy()
-    _, means, covariances, _, _ = filtering.run(layout, values)
-    mean, variance = smoothing.smooth(layout, values, rows, means, covariances)
+    _, track, _, _ = filtering.run(layout, values)
+    mean, variance = smoothing.smooth(layout, values, rows, track)
     exact_mean, exact = case.given()
     start = 0
     for signal, s in signals.items():
@@ -138,10 +138,8 @@ def test_smoothed_signals(name, noise):
 def test_leave_one_out(name, noise):
     """Each noise-free output given all samples but its own, with those of the same time."""
     case = case_of(name, noise)
-    _, means, covariances, _, _ = filtering.run(case.problem.layout, case.values)
-    mean, variance, _ = smoothing.leave_one_out(
-        case.problem.layout, case.values, means, covariances
-    )
+    _, track, _, _ = filtering.run(case.problem.layout, case.values)
+    mean, variance, _ = smoothing.leave_one_out(case.problem.layout, case.values, track)
     there = ~np.isnan(case.y)
     assert np.array_equal(~np.isnan(mean), there)
     assert np.array_equal(~np.isnan(variance), there)
@@ -182,7 +180,7 @@ def test_predictions_and_innovations(name, noise):
 def test_last_state(name):
     """What the last state says of each signal at the last time is what all outputs say of it."""
     case = case_of(name)
-    _, _, _, m, P = filtering.run(case.problem.layout, case.values)
+    _, _, m, P = filtering.run(case.problem.layout, case.values)
     exact_mean, exact = case.given()
     for signal, s in case.assembly.signals.items():
         if s.rows is None:
@@ -201,7 +199,7 @@ def test_last_state_goes_on(noise, known_start):
     cut = 13
     head = assemble(case.system, time_grid(case.time[:cut]), tensor(case.inputs[:cut]))
     problem = head.with_outputs(tensor(case.y[:cut]))
-    _, _, _, m, P = filtering.run(problem.layout, element(problem))
+    _, _, m, P = filtering.run(problem.layout, element(problem))
     system = oracles.random_system(len("two outputs"), pairs=3, inputs=1, outputs=2, noise=noise)
     J = 6
     z = head.known_state.numpy() + m[:J]
@@ -228,10 +226,10 @@ def test_one_dynamic_layer_is_the_linear_gaussian_process(name, noise):
     exact = process.observed(sd).log_prob(y)
     torch.testing.assert_close(observed.log_prob(y), exact, rtol=1e-9, atol=0.0)
     noiseless = process.condition(y, sd)
-    _, means, covariances, _, _ = filtering.run(case.problem.layout, case.values)
+    _, track, _, _ = filtering.run(case.problem.layout, case.values)
     signal = case.assembly.signals["g"]
     rows = signal.rows.numpy()
-    mean, variance = smoothing.smooth(case.problem.layout, case.values, rows, means, covariances)
+    mean, variance = smoothing.smooth(case.problem.layout, case.values, rows, track)
     found = signal.known.numpy() + mean @ rows.T + case.offset
     shape = noiseless.mean.shape
     assert_close(found.reshape(shape), noiseless.mean, rtol=1e-8)

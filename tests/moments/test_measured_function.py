@@ -173,10 +173,10 @@ def test_a_linear_function_gives_what_joint_moments_give():
     for measured in (False, True):
         problem = replace(wiener.problem(measured), table_mean=(1.2 * grid + 0.1)[None])
         values = element(problem)
-        total, means, covariances, m, P = filtering.run(problem.layout, values)
+        total, track, m, P = filtering.run(problem.layout, values)
         rows = np.array([[*wiener.system.C[0], 0.0]])
-        smooth = smoothing.smooth(problem.layout, values, rows, means, covariances)
-        out = smoothing.leave_one_out(problem.layout, values, means, covariances)
+        smooth = smoothing.smooth(problem.layout, values, rows, track)
+        out = smoothing.leave_one_out(problem.layout, values, track)
         ahead = smoothing.predict_ahead(problem.layout, values, 3)
         new = smoothing.innovate(problem.layout, values)
         found.append([total, m[:2], P[:2, :2], smooth[0][:, :2], smooth[1], *out, *ahead, *new])

@@ -38,8 +38,8 @@ def smoothed(w, measured):
     problem = w.problem(measured)
     values = element(problem)
     row = np.array([[*w.system.C[0], 0.0]])
-    _, means, covariances, _, _ = filtering.run(problem.layout, values)
-    mean, variance = smoothing.smooth(problem.layout, values, row, means, covariances)
+    _, track, _, _ = filtering.run(problem.layout, values)
+    mean, variance = smoothing.smooth(problem.layout, values, row, track)
     linear = oracles.run(problem.layout, values, oracles.linearised)
     linear_mean, _ = oracles.smooth(problem.layout, values, linear)
     ours = w.known + mean @ row[0], np.sqrt(variance[:, 0])
@@ -203,8 +203,8 @@ def test_leave_one_out_density_by_brute_force(name, measured, error):
         w = Wiener(name, 4, seed=seed)
         problem = w.problem(measured)
         values = element(problem)
-        _, means, covariances, _, _ = filtering.run(problem.layout, values)
-        found = smoothing.leave_one_out(problem.layout, values, means, covariances)
+        _, track, _, _ = filtering.run(problem.layout, values)
+        found = smoothing.leave_one_out(problem.layout, values, track)
         ours.append(found[2][:, 0])
         noise = w.noise_sd**2
         whole = brute_force(w.known, w.covariance, w.f, w.y, noise, nodes=27)[0]

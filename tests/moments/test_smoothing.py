@@ -37,8 +37,8 @@ def test_smoothed_moments(name):
     layout, values, plain = filtered(name)
     A = values.G.shape[1]
     rows = np.concatenate([np.eye(A), np.random.default_rng(0).standard_normal((2, A))])
-    _, means, covariances, _, _ = filtering.run(layout, values)
-    mean, variance = smoothing.smooth(layout, values, rows, means, covariances)
+    _, track, _, _ = filtering.run(layout, values)
+    mean, variance = smoothing.smooth(layout, values, rows, track)
     exact_mean, exact = oracles.smooth(layout, values, plain)
     assert_close(mean, exact_mean, rtol=1e-8)
     assert_close(variance, np.einsum("ra,nab,rb->nr", rows, exact, rows), rtol=1e-8)
@@ -47,11 +47,11 @@ def test_smoothed_moments(name):
 @pytest.mark.parametrize("name", CASES)
 def test_last_state(name):
     layout, values, plain = filtered(name)
-    _, means, covariances, m, P = filtering.run(layout, values)
+    _, track, m, P = filtering.run(layout, values)
     assert_close(m, plain.after[-1][0], rtol=1e-9)
     assert_close(P, plain.after[-1][1], rtol=1e-9)
     N = len(values.m0)
-    for place, (kept_mean, kept) in enumerate(zip(means, covariances, strict=True)):
+    for place, (kept_mean, kept) in enumerate(zip(track.means, track.covariances, strict=True)):
         before_mean, before = plain.before[place * SEGMENT]
         assert_close(kept_mean, before_mean[:N], rtol=1e-9)
         assert_close(kept, before[:N, :N], rtol=1e-9)
@@ -100,8 +100,8 @@ def test_smoothing_narrows_and_needs_no_process_noise():
     layout, values, _ = filtered("table")
     flat = values._replace(Q=np.zeros_like(values.Q), P0=np.outer(*[np.arange(1.0, 5.0)] * 2) / 20)
     rows = np.eye(values.G.shape[1])
-    _, means, covariances, _, _ = filtering.run(layout, flat)
-    mean, variance = smoothing.smooth(layout, flat, rows, means, covariances)
+    _, track, _, _ = filtering.run(layout, flat)
+    mean, variance = smoothing.smooth(layout, flat, rows, track)
     filtered_variance = np.array([np.diag(P) for _, P in oracles.run(layout, flat).after])
     assert np.isfinite(mean).all()
     assert (variance >= 0.0).all()

@@ -8,10 +8,12 @@ import pyro
 import pytest
 import torch
 from scipy import stats
+from scipy.optimize import minimize
 from scipy.stats import kurtosis
 
 import pyro_dynogp as dgp
 from pyro_dynogp.distributions.process import ConditionedLTIProcess
+from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.prediction.first_state import estimate
 from tests.models.outputs import by_moments, physical_of, prior_process
@@ -388,6 +390,26 @@ class TestBeginning:
         error = (record.outputs - fit.predict(record).mean)[:5]
         assert np.abs(error).max() < 0.3
         assert np.isfinite(fit.log_likelihood(record)).all()
+
+    def test_it_is_the_most_probable_one(self):
+        """To what a general optimiser with a tolerance of rounding finds."""
+        fit = wiener_fit(noise_sd=0.02, drift=0.05)
+        record, _ = wiener_data(fit, n=60, x0=torch.tensor([0.5 - 0.6j], dtype=torch.complex128))
+        prepared = PreparedRecord.of(record, fit.scaling)
+        z = estimate(fit, prepared)["g"]
+
+        def energy(x):
+            at = torch.tensor(x, requires_grad=True)
+            begun = fit.model.begin(fit.system_at(fit.mode), {"g": at})
+            value = 0.5 * at.square().sum() - output_process(begun, prepared).log_prob(
+                prepared.observations
+            )
+            (gradient,) = torch.autograd.grad(value, at)
+            return value.item(), gradient.numpy()
+
+        tight = {"ftol": 1e-15, "gtol": 1e-9, "maxiter": 500}
+        exact = minimize(energy, z.numpy() + 0.1, jac=True, method="L-BFGS-B", options=tight)
+        np.testing.assert_allclose(z, exact.x, atol=1e-6)
 
     def test_without_outputs_it_is_unknown(self):
         fit = wiener_fit()

@@ -75,14 +75,17 @@ def variational(
     *,
     independent: bool = False,
     key: str = "posterior",
+    fixed: dict[str, Tensor] | None = None,
 ) -> VariationalPosterior:
     """Fit a multivariate normal to the posterior by Pyro's SVI, from values near its mode.
 
     With `independent` its covariance is diagonal (Pyro's AutoDiagonalNormal). Stops early when the
     ELBO, averaged over 50 steps, has not risen by 0.05 nats in 200 steps, and does not start where
-    Laplace's approximation has less than that to gain, as on long records.
+    Laplace's approximation has less than that to gain, as on long records. `fixed` are values of
+    sites that are none of it.
     """
-    potential = Potential(model, args, values)
+    potential = Potential(model, args, values, fixed)
+    model = potential.model
     if independent:
         # Narrow at first: ridges are thin.
         at = {name: value.detach() for name, value in values.items()}

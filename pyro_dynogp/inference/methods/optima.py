@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
-import pyro
 import torch
 from torch import Tensor
 
@@ -154,9 +153,10 @@ class _Around:
 
     def posterior(self) -> VariationalPosterior:
         """The normal of the free sites."""
-        conditioned = pyro.poutine.condition(self.problem.target, data=self.fixed)
-        args = (self.problem.records,)
-        return variational(conditioned, args, self.free, self.run, self.schedule, key=self.key)
+        return variational(
+            self.problem.target, (self.problem.records,), self.free, self.run, self.schedule,
+            key=self.key, fixed=self.fixed,
+        )  # fmt: skip
 
     def evidence(self) -> float:
         """Laplace's approximation of log p(y) [nats]; all sites are free."""

@@ -245,9 +245,9 @@ def _linear_state(
         assembly = assemble(system, record.grid, record.scaled_inputs)
         problem = assembly.with_outputs(record.scaled_outputs)
         elements, _ = problem.elements()
-        _, means, covariances, _, _ = filtering.run(problem.layout, elements[0])
+        _, track, _, _ = filtering.run(problem.layout, elements[0])
         rows = np.zeros((0, problem.G.shape[-1]))
-        first = smoothing.smooth(problem.layout, elements[0], rows, means, covariances)[0][0]
+        first = smoothing.smooth(problem.layout, elements[0], rows, track)[0][0]
         dynamic = system.layers[0]
         assert isinstance(dynamic, DynamicSystem)
         past, whole = dynamic.past_inputs, dynamic.prior_state().covariance
