@@ -135,7 +135,7 @@ class Direct:
 
     def __init__(self, model: Model, records: Records) -> None:
         self.model = model
-        self.records = model.prepare(records)
+        self.records = model.begun(model.prepare(records))
         self.sites = model.all_sites(self.records[0].scaling, len(self.records))
         self.prior = Priors(self.sites)
         self.observations = [record.observations for record in self.records]
