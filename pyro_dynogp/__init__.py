@@ -23,6 +23,7 @@ if TYPE_CHECKING:  # the same names, for editors and type checkers; a test compa
     from pyro_dynogp.criticism.simulation_based import (
         simulation_based_calibration as simulation_based_calibration,
     )
+    from pyro_dynogp.data.channels.signal import Delayed as Delayed
     from pyro_dynogp.data.record import Record as Record
     from pyro_dynogp.data.scaling import Scaling as Scaling
     from pyro_dynogp.data.scaling import TimeScale as TimeScale
@@ -105,6 +106,7 @@ HOMES = {
     "StudentT": "layers.noise",
     "Heteroscedastic": "layers.noise",
     "TimeScale": "data.scaling",
+    "Delayed": "data.channels.signal",
     # Criticism of a fit, and the loop that extends its model.
     "loo": "criticism.loo",
     "compare": "criticism.comparison",

@@ -149,7 +149,8 @@ class Fit(Fitted):
 
         Groups:
 
-        - posterior: every latent site (chain, draw, *shape), in scaled units; trajectories where
+        - posterior: every latent site (chain, draw, *shape), in scaled units (``delay`` in units of
+          time); trajectories where
           the guide had them; and in physical units decay rate, frequency and time constant of each
           pole, gains of a linear model, scale of the measurement noise and offset of the outputs.
           Chains are those of NUTS, else one; "map" has one draw.
@@ -220,7 +221,9 @@ def fit(
 
     Args:
         model: a `LinearDynamicGP` or a `Cascade` (`Wiener`, `Hammerstein`, ...).
-        record: training record, or a sequence of them; scaling is learnt from it alone.
+        record: training record, or a sequence of them; scaling is learnt from it alone. Of a model
+            with dead times that are parameters (`Delayed`) outputs are missing in the fit until the
+            first input of the record is likely to have arrived, a quarter of it at most.
         method: "importance", "map", "svi", "nuts", or an object with options of its own:
             `Importance`, `Mode`, `Normal`, `Nuts`, `Trajectories`. By default "svi" where the model
             has static layers, else "importance".

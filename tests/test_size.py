@@ -14,9 +14,9 @@ LINES = 31_500
 # Gauss-Newton (1900 lines), nonlinear feedback (650 lines), known functions and branches (430
 # lines), integrators (450 lines), checks of arguments, two effects (330 lines), a closed loop that
 # does no harm (510 lines), forecasts in `check` (120 lines) and densities of linear models without
-# torch (1640 lines), the filter's kernels and moments of functions in lanes (480 lines)
-# came since. To shrink, and to go.
-LINES_TODAY = 43_930
+# torch (1640 lines), the filter's kernels and moments of functions in lanes (480 lines), hidden
+# signals (180 lines) and dead times with a posterior (1230 lines) came since. To shrink, and to go.
+LINES_TODAY = 45_350
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

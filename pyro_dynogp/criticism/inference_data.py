@@ -28,6 +28,7 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.records import one_record
 from pyro_dynogp.inference.pareto import good_k, psis
 from pyro_dynogp.inference.posterior_draws import PosteriorDraws
+from pyro_dynogp.models.arrival import DELAY
 from pyro_dynogp.models.output_process import OutputProcess
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.prediction.first_state import beginning
@@ -146,7 +147,7 @@ class _Export:
             name: Variable(
                 value.numpy(),
                 dimensions_for(name, value.shape[1:], self.dims),
-                {"units": "scaled"},
+                {"units": self.fit.scaling.time_unit if name == DELAY else "scaled"},
             )
             for name, value in values.items()
         }

@@ -10,6 +10,7 @@ import numpy as np
 from pyro_dynogp.criticism.labelled import Coordinate, clock_of
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.scaling import Scaling
+from pyro_dynogp.models.arrival import LATE
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.wiring import INPUTS
 
@@ -66,6 +67,11 @@ def labels_of(model: Model, scaling: Scaling, records: Sequence[Record]) -> dict
             dim = wire.dims[role]
             if dim != "input" and names:
                 labels[dim] = (dim, np.array(names), {})
+    late = {channel.names[0] for channel in model.late}
+    for dim, chosen in ((LATE, True), ("prompt input", False)):
+        names = tuple(n for n in scaling.input_names if (n in late) == chosen) if late else ()
+        if names:
+            labels[dim] = (dim, np.array(names), {})
     for suffix, record in zip(suffixes_of(records), records, strict=True):
         labels |= clock_of(record, f"time{suffix}")
     return labels

@@ -18,6 +18,7 @@ from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.methods.numbers import Number, number_posterior
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.lti.views import steady_state_gain
+from pyro_dynogp.models.arrival import DELAY
 from pyro_dynogp.models.delays import where_inputs_are_known
 from pyro_dynogp.models.model import Model
 
@@ -45,6 +46,10 @@ def parameters_of(fit: Fit, channels: Sequence[Channel], record: Record) -> Para
     if acting and fit.model.outputs == 1:
         drawn = _drawn(fit)
         out |= _weights(fit, acting, drawn) | _gains(fit, acting, drawn)
+    for k, one in enumerate(fit.model.late):
+        if one in present:
+            label = _label(f"dead time of {one.channel}", record.time_unit)
+            out[label] = _moments(_drawn(fit)[DELAY][:, k].numpy())
     for group in _together(present):
         out |= _numbers(fit, group, record)
     return out
@@ -94,10 +99,11 @@ def _gains(fit: Fit, channels: Sequence[Channel], drawn: Mapping[str, Tensor]) -
 
 
 def _together(channels: Sequence[Channel]) -> list[list[Channel]]:
-    """Channels with numbers; those that share one dead time in one group."""
+    """Channels with given numbers; those that share one dead time in one group."""
     groups: list[list[Channel]] = []
+    late = [one for one in channels if isinstance(one, Delayed) and one.free]
     for one in channels:
-        if not one.numbers:
+        if not one.numbers or one in late:
             continue
         shared = [g for g in groups if isinstance(one, Delayed) and isinstance(g[0], Delayed)
                   and g[0].delay == one.delay]  # fmt: skip
@@ -111,7 +117,9 @@ def _together(channels: Sequence[Channel]) -> list[list[Channel]]:
 def _numbers(fit: Fit, group: Sequence[Channel], record: Record) -> Parameters:
     """Of the numbers that a channel, or a group with the same ones, is made with."""
     first = group[0]
-    if isinstance(first, Delayed):  # all delays that are likely, on the same samples
+    if (
+        isinstance(first, Delayed) and first.delay is not None
+    ):  # all delays that are likely, on the same samples
         reach = DELAYS * first.delay + STEPS * record.sampling_time
         record = where_inputs_are_known(record, min(reach, LOST * record.duration))
     whole = prepared(record, fit.model.channels)

@@ -116,12 +116,14 @@ class DeadTime(Effect):
         late = set_last(model, Delayed, "delay")
         names = " and ".join(repr(channel.channel) for channel in late)
         start = f"Channel {names} acts" if len(late) == 1 else f"Channels {names} act"
+        assert late[0].delay is not None
         return f"{start} with a dead time of {late[0].delay:.3g}{unit_of(evidence)}."
 
     def refine(self, model: Model, record: Record, times: int) -> Sequence[Model]:
         """The delay a little shorter and longer, a sample or two at least."""
         late = set_last(model, Delayed, "delay")
         delay, step = late[0].delay, record.sampling_time
+        assert delay is not None
         near = {share * delay for share in FINER[times]}
         if record.is_regular:
             near |= {delay + k * step for k in (-2, -1, 1, 2)}
@@ -131,11 +133,16 @@ class DeadTime(Effect):
 
 
 def _later(model: Model, names: Sequence[str], more: float, least: float) -> Model | None:
-    """The model with inputs delayed by more than they are; None for less than the least delay."""
+    """The model with inputs delayed by more than they are.
+
+    None for less than the least delay, and where the delay of one is a parameter already.
+    """
     for name in names:
         source, known = name, 0.0
         for channel in model.channels:
             if isinstance(channel, Delayed) and name in channel.names:  # correct the delay it has
+                if channel.delay is None:
+                    return None
                 source, known = channel.channel, channel.delay
                 model = without_channel(model, channel)
         if known + more < least:

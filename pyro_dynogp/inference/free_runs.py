@@ -14,6 +14,7 @@ from pyro_dynogp.inference.optimise.maximum import Optimum
 from pyro_dynogp.inference.starts.poles import grown
 from pyro_dynogp.lti.arithmetic import SEGMENT
 from pyro_dynogp.models.assembly import assemble
+from pyro_dynogp.models.late_systems import arrive
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.moments import filtering
@@ -45,7 +46,8 @@ def free_run_error(
         for index, record in enumerate(records):
             suffix = "" if len(records) == 1 else f"_{index}"
             here = model.begin(system, model.states_of(values, suffix))
-            assembly = assemble(here, record.grid, record.scaled_inputs)
+            seen = arrive(here, record)
+            assembly = assemble(seen.system, record.grid, seen.scaled)
             problem = assembly.with_outputs(record.scaled_outputs)
             (numbers,), _ = problem.elements()
             means = filtering.run(problem.layout, numbers)[1].means

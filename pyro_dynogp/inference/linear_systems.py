@@ -38,6 +38,7 @@ class LinearSystems:
 
     Attributes:
         name: of the layer. layer: which one. inputs: that it sees. direct: that act at once.
+        prompt: columns of the inputs that have a direct path, where there is any.
         places: of each site its part of a vector. shapes: of each site.
         time: scale of the training record.
     """
@@ -49,6 +50,7 @@ class LinearSystems:
     places: Mapping[str, slice]
     shapes: Mapping[str, tuple[int, ...]]
     time: TimeScale
+    prompt: tuple[int, ...]
 
     @property
     def states(self) -> int:
@@ -122,7 +124,7 @@ class LinearSystems:
             self._give_integrators(out, bars)
         first = 0
         if f"{self.name}_feedthrough" in self.places:
-            first = self.inputs
+            first = len(self.prompt)
             self._give(out, f"{self.name}_feedthrough", bars.D[..., :first])
         if self.direct:
             self._give(out, "direct", bars.D[..., first:])

@@ -137,7 +137,7 @@ class Direct:
 
     def __init__(self, model: Model, records: Records, fixed: Values | None = None) -> None:
         self.model = model
-        self.records = model.prepare(records)
+        self.records = model.begun(model.prepare(records))
         self.fixed = {name: value.detach() for name, value in (fixed or {}).items()}
         sites = model.all_sites(self.records[0].scaling, len(self.records))
         self.sites = [site for site in sites if site.name not in self.fixed]

@@ -16,6 +16,7 @@ import torch
 from pyro.distributions import HalfCauchy, HalfNormal, LogNormal, Normal, Uniform
 from torch import Tensor
 
+from pyro_dynogp.distributions.dead_time import NONE, DeadTime
 from pyro_dynogp.distributions.decay import LogDecayRate
 from pyro_dynogp.distributions.shared_scale import SharedScaleNormal
 from pyro_dynogp.layers.sites import Site
@@ -121,6 +122,9 @@ class VectorPriors:
         elif kind is HalfCauchy:
             put("exponential")
             put("half cauchy", base.scale)
+        elif kind is DeadTime:
+            put("late", base.step)
+            put("half cauchy", base.median)
         elif kind is LogNormal:
             put("exponential")
             put("log normal", base.loc, base.scale)
@@ -158,6 +162,15 @@ class VectorPriors:
             slope[:, at] = x[:, at] = np.exp(here)
             by_u[:, at] = 1.0
             log_jacobian += here.sum(1)
+        if found := self._of("late"):
+            at, step, _ = found
+            here = np.take(u, at, 1) / NONE
+            apart = np.log1p(np.exp(-np.abs(here)))
+            q = NONE * (np.maximum(here, 0.0) + apart)
+            share = np.exp(np.minimum(here, 0.0) - apart)  # dq/du
+            x[:, at], slope[:, at] = step * np.expm1(q), step * np.exp(q) * share
+            by_u[:, at] = share + (1.0 - share) / NONE
+            log_jacobian += (np.log(step) + q + np.minimum(here, 0.0) - apart).sum(1)
         if found := self._of("below"):
             at, upper, _ = found
             here = np.take(u, at, 1)

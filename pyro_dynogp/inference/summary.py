@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
 from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.stability import warnings_of
 from pyro_dynogp.lti.modes import Modes
+from pyro_dynogp.models.arrival import DELAY
 from pyro_dynogp.models.wiring import Dynamic, Known, Layer
 
 
@@ -31,11 +34,27 @@ def summary(fit: Fitted) -> str:
         for name in wire.layer.parameters if isinstance(wire.layer, Known) else ():
             draws = fit.draws[f"{wire.name}_{name}"]
             lines.append(f"{wire.name}_{name}: {float(draws.mean()):.4g}")
+    lines.extend(_dead_times(fit))
     if not model.likelihood.varying:
         sd = ", ".join(f"{value:.4g}" for value in fit.noise_sd)
         lines.append(f"measurement noise sd: {sd}")
     lines.extend(f"warning: {sentence}" for sentence in warnings_of(fit))
     return "\n".join(lines)
+
+
+def _dead_times(fit: Fitted) -> list[str]:
+    """Those that are parameters; with their spread where the draws are not of the optima alone."""
+    lines = []
+    posterior = fit.posterior
+    at_optima = isinstance(posterior, Mixture) and DELAY in posterior.points
+    for k, channel in enumerate(fit.model.late):
+        d = fit.draws[DELAY][:, k]
+        line = f"dead time of {channel.channel}: {float(d.mean()):.4g} {fit.scaling.time_unit}"
+        if len(d) > 1 and not at_optima:
+            low, high = np.quantile(d.numpy(), [0.05, 0.95])
+            line += f", sd {float(d.std()):.2g}, 90 % from {low:.4g} to {high:.4g}"
+        lines.append(line)
+    return lines
 
 
 def _posterior(fit: Fitted) -> str:

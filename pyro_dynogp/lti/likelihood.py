@@ -33,6 +33,8 @@ class Systems(NamedTuple):
         poles: (k, P) complex [1/s]. B: (k, P, n_u), L: (k, P, n_l) complex. C: (k, n_y, P)
             complex, ones where there is one output. drift: (k, P), complex, what drives them
             always. D: (k, n_y, n_d). offset: (k, n_y). variance: (k, n_y) of measurement noise.
+        late: (k, P, n_v) complex, gains of the last columns of `driving`, which past inputs have
+            not moved the first state through; None for none.
     """
 
     poles: np.ndarray
@@ -43,6 +45,7 @@ class Systems(NamedTuple):
     D: np.ndarray
     offset: np.ndarray
     variance: np.ndarray
+    late: np.ndarray | None = None
 
 
 class Past(NamedTuple):
@@ -91,8 +94,9 @@ def innovations_of(
     """Innovations z and variances d, both (k, n n_y), and the tape of `gradients`.
 
     Args:
-        systems: at which. signals: of the record; `driving` has a last column of ones where there
-            is a drift. missing: (1, n n_y), or (0, n n_y) where nothing is. past: of all systems.
+        systems: at which. signals: of the record; `driving` has the columns of B, one of ones
+            where there is a drift, and the late ones. missing: (1, n n_y), or (0, n n_y) where
+            nothing is. past: of all systems.
         keep: whether gradients will be asked for.
     """
     k, n_y, P = systems.C.shape
@@ -101,7 +105,8 @@ def innovations_of(
     poles, B, C, L = systems.poles, systems.B, systems.C, systems.L
     initial_covariances(poles, B, C, L, past.shared, past.memory, past.level, q, start)
     drift = systems.drift
-    driven = B if drift is None else np.concatenate([B, drift[..., None]], -1)
+    parts = [B, *([] if drift is None else [drift[..., None]])]
+    driven = np.concatenate([*parts, *([] if systems.late is None else [systems.late])], -1)
     level = np.concatenate([systems.D, systems.offset[..., None]], -1)
     gains = Gains(*(to_lanes(x) for x in (poles, driven, C, level)))
     points = Points(gains.poles, to_lanes(q), gains.C if n_y > 1 else None, to_lanes(start))
@@ -132,7 +137,8 @@ def gradients(tape: Tape, z_bar: np.ndarray, d_bar: np.ndarray) -> Systems:
     poles_bar = from_lanes(found.poles + held.poles, k).view(complex)
     C_bar = from_lanes(found.C + held.C, k).view(complex).reshape(k, n_y, P)
     driven_bar = from_lanes(held.B, k).view(complex).reshape(k, P, -1)
-    B_bar = np.ascontiguousarray(driven_bar[..., : systems.B.shape[-1]])
+    n_u = systems.B.shape[-1]
+    B_bar = np.ascontiguousarray(driven_bar[..., :n_u])
     L_bar = np.zeros_like(systems.L)
     reverse_initial_covariances(
         systems.poles, systems.B, systems.C, systems.L, past.shared, past.memory,
@@ -140,10 +146,14 @@ def gradients(tape: Tape, z_bar: np.ndarray, d_bar: np.ndarray) -> Systems:
         poles_bar, B_bar, C_bar, L_bar,
     )  # fmt: skip
     level = from_lanes(held.D, k).reshape(k, n_y, -1)
-    drift = None if systems.drift is None else driven_bar[..., -1]
+    drift = None if systems.drift is None else driven_bar[..., n_u]
+    late = None
+    if systems.late is not None:
+        late = driven_bar[..., n_u + (systems.drift is not None) :]
     return Systems(
-        poles_bar, B_bar, C_bar, L_bar, drift, level[..., :-1], level[..., -1], noise_bar[:, 0]
-    )
+        poles_bar, B_bar, C_bar, L_bar, drift, level[..., :-1], level[..., -1], noise_bar[:, 0],
+        late,
+    )  # fmt: skip
 
 
 def to_lanes(x: np.ndarray) -> np.ndarray:

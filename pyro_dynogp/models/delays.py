@@ -17,9 +17,12 @@ from pyro_dynogp.models.variants import Model
 
 
 def longest_delay(*models: Model) -> float:
-    """Longest delay of an input in any of the models [time unit], zero where there is none."""
-    delays = [c.delay for model in models for c in model.channels if isinstance(c, Delayed)]
-    return max([0.0, *delays])
+    """Longest given delay of an input in any of the models [time unit], zero where there is none.
+
+    `fit` leaves out what it has to where the delay is a parameter.
+    """
+    late = [c for model in models for c in model.channels if isinstance(c, Delayed)]
+    return max([0.0, *(c.delay for c in late if c.delay is not None)])
 
 
 def unknown_beginning(record: Record, delay: float) -> int:

@@ -15,16 +15,17 @@ from pyro_dynogp.data.scaling import Scaling, TimeScale
 from pyro_dynogp.layers.functions import StaticFunction, support_points
 from pyro_dynogp.layers.sites import Site, Values, sample
 from pyro_dynogp.layers.static import StaticPrior
+from pyro_dynogp.models.arrival import DELAY, Delays, columns_of, delay_site
 from pyro_dynogp.models.explicit import observe_explicit
 from pyro_dynogp.models.known import known_function, known_sites
 from pyro_dynogp.models.limits import at_limits, log_probability_scale, scaled_limits
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.past_inputs import past_input_covariance
-from pyro_dynogp.models.prepared import Records
+from pyro_dynogp.models.prepared import PreparedRecord, Records
 from pyro_dynogp.models.priors import FLAT, ModesPrior, direct_site
 from pyro_dynogp.models.structure import Structure
 from pyro_dynogp.models.system import DynamicSystem, StaticSystem, System
-from pyro_dynogp.models.wiring import Dynamic, Known, Static, Wire
+from pyro_dynogp.models.wiring import INPUTS, Dynamic, Known, Static, Wire
 
 
 @dataclass(frozen=True)
@@ -39,12 +40,14 @@ class Model(Structure):
     Sites, for a dynamic layer g those of `ModesPrior` (``g_log_decay``, ...), for a static layer f
     those of `StaticPrior` (``f_values``, the whitened inducing values, ...); ``direct`` (n_y, K)
     for inputs that act at once; ``offset`` (n_y,) where a dynamic layer comes last; the
-    likelihood's sites (``noise_sd`` (n_y,), log-normal around 0.1); ``y``. Where trajectories are
-    not integrated out: the trajectory ``g`` (n,) or (n, width), and ``f``, in a last layer a site
-    of its own, the conditional given the inducing values; below a dynamic layer one function along
-    the path, which ``f_residual`` completes (`pyro.deterministic`). With several records first
-    states, trajectories and outputs are numbered (``g_0``, ``y_0``, ...). Where the last layer has
-    limits, a factor ``at_limits`` makes probabilities of outputs that are exactly there.
+    likelihood's sites (``noise_sd`` (n_y,), log-normal around 0.1); ``delay`` (K,), dead times in
+    the record's unit of time, of inputs that channels delay by no given number (`Delayed`); ``y``.
+    Where trajectories are not integrated out: the trajectory ``g`` (n,) or (n, width), and ``f``,
+    in a last layer a site of its own, the conditional given the inducing values; below a dynamic
+    layer one function along the path, which ``f_residual`` completes (`pyro.deterministic`). With
+    several records first states, trajectories and outputs are numbered (``g_0``, ``y_0``, ...).
+    Where the last layer has limits, a factor ``at_limits`` makes probabilities of outputs that are
+    exactly there.
 
     Args:
         inputs: n_u, may be 0; those that channels make included.
@@ -88,7 +91,7 @@ class Model(Structure):
         time_scale, flat = TimeScale.of(scaling), self.priors == "paper"
         for w in self.wires:
             if isinstance(w.layer, Dynamic):
-                yield from self._modes_prior(w, w.layer, time_scale).sites(w.dims)
+                yield from self._modes_prior(w, w.layer, scaling).sites(w.dims)
             elif isinstance(w.layer, Known):
                 yield from known_sites(w.name, w.layer)
             else:
@@ -105,6 +108,8 @@ class Model(Structure):
             prior = dist.Normal(zero, zero + (FLAT if flat else time_scale.brevity)).to_event(1)
             yield Site("offset", prior, ("output",))
         yield from self.likelihood.sites(self.outputs, self.inputs - self.direct, flat=flat)
+        if self.late:
+            yield delay_site(self.late, scaling)
 
     def state_sites_of(self, suffix: str) -> tuple[Site, ...]:
         """Sites of what past inputs left at the first sample of a record.
@@ -133,11 +138,10 @@ class Model(Structure):
         Args:
             values: of the sites of `sites`. scaling: of the training record.
         """
-        time_scale = TimeScale.of(scaling)
         layers: list[DynamicSystem | StaticSystem] = []
         for w in self.wires:
             if isinstance(w.layer, Dynamic):
-                layers.append(self.dynamic_system(w, w.layer, values, time_scale))
+                layers.append(self.dynamic_system(w, w.layer, values, scaling))
             elif isinstance(w.layer, Known):
                 layers.append(StaticSystem(known_function(self, w, w.layer, values, scaling)))
             else:
@@ -146,18 +150,21 @@ class Model(Structure):
         direct = values["direct"] if self.direct else None
         last = isinstance(self.output_wire.layer, Dynamic)
         offset = values["offset"] if last else None
-        return System(self.wires, tuple(layers), noise, offset, direct)
+        delays = None
+        if self.late:
+            delays = Delays(columns_of(self.late, scaling), values[DELAY])
+        return System(self.wires, tuple(layers), noise, offset, direct, delays)
 
     def sample_system(self, scaling: Scaling) -> System:
         """Sample the parameters of all layers."""
         return self.system(sample(self.sites(scaling)), scaling)
 
     def dynamic_system(
-        self, place: Wire, layer: Dynamic, values: Values, time_scale: TimeScale
+        self, place: Wire, layer: Dynamic, values: Values, scaling: Scaling
     ) -> DynamicSystem:
         """One dynamic layer at values of its sites."""
-        modes = self._modes_prior(place, layer, time_scale).modes(values)
-        memory = 1.0 / time_scale.typical_rate
+        modes = self._modes_prior(place, layer, scaling).modes(values)
+        memory = 1.0 / TimeScale.of(scaling).typical_rate
         if place.fed and place.channels:
             return DynamicSystem(modes, past_input_covariance(modes, memory, place.channels))
         return DynamicSystem(modes, memory)
@@ -185,7 +192,8 @@ class Model(Structure):
         support = support_points(function.locations, layer.support)
         return StaticSystem(function, support, values[f"{place.name}_residual"])
 
-    def _modes_prior(self, place: Wire, layer: Dynamic, time_scale: TimeScale) -> ModesPrior:
+    def _modes_prior(self, place: Wire, layer: Dynamic, scaling: Scaling) -> ModesPrior:
+        columns = columns_of(self.late, scaling) if place.sources == (INPUTS,) else ()
         return ModesPrior(
             place.name,
             inputs=place.channels + place.fed,
@@ -195,10 +203,11 @@ class Model(Structure):
             noise=layer.noise,
             feedthrough=layer.feedthrough,
             process_noise=layer.process_noise,
-            time_scale=time_scale,
+            time_scale=TimeScale.of(scaling),
             priors=self.priors,
             fed=place.fed,
             integrators=layer.integrators,
+            late=tuple(column for column in columns if column < place.channels),
         )
 
     @staticmethod
@@ -223,7 +232,7 @@ class Model(Structure):
         Args:
             records: with inputs and outputs; prepared ones are not checked again.
         """
-        several = self.prepare(records)
+        several = self.begun(self.prepare(records))
         system = self.sample_system(several[0].scaling)
         for index, record in enumerate(several):
             suffix = "" if len(several) == 1 else f"_{index}"
@@ -238,6 +247,16 @@ class Model(Structure):
             at = at_limits(self.layers, record.record)
             if at.any():
                 pyro.factor(f"at_limits{suffix}", log_probability_scale(at, outputs))
+
+    def begun(self, records: tuple[PreparedRecord, ...]) -> tuple[PreparedRecord, ...]:
+        """Records as the density has them, see `PreparedRecord.begun`.
+
+        Models without free dead times, and those whose first states or trajectories are sites along
+        the whole record, have all of it.
+        """
+        if not self.late or self.state_sites or self.integrate != "all":
+            return records
+        return tuple(record.begun if record.has_outputs else record for record in records)
 
     def sample_states(self, suffix: str) -> dict[str, Tensor]:
         """Sample what past inputs left at the first sample of a record, by layer."""

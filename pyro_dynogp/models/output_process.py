@@ -24,6 +24,7 @@ from pyro_dynogp.models.draws import (
     noise_variance,
 )
 from pyro_dynogp.models.feedback_draws import draw_outputs
+from pyro_dynogp.models.late_systems import arrive
 from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.models.system import DynamicSystem, System
 from pyro_dynogp.support.parallel import seeded
@@ -84,9 +85,9 @@ class OutputProcess(TorchDistribution):
         *,
         validate_args: bool | None = None,
     ) -> None:
-        self.system, self.scaling, self.start = system, record.scaling, start
-        self.grid, self.inputs = record.grid, record.inputs
-        self.scaled_inputs = record.scaled_inputs
+        seen = arrive(system, record)
+        self.system, self.scaling, self.start = seen.system, seen.scaling, start
+        self.grid, self.inputs, self.scaled_inputs = record.grid, seen.inputs, seen.scaled
         n_y = len(self.scaling.output_scale)
         self.several = n_y > 1
         event = (len(self.grid), n_y) if self.several else (len(self.grid),)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from pyro_dynogp.data.record import Record
@@ -12,6 +14,14 @@ from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.lti.grid import TimeGrid, time_grid
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.tensors import as_tensor
+
+
+class Surroundings(NamedTuple):
+    """A longer stretch that a record is part of: times (m,), inputs (m, n_u), its first sample."""
+
+    time: Tensor
+    inputs: Tensor
+    first: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +37,7 @@ class PreparedRecord:
         inputs: u (n, n_u) float64 [input].
         scaled_inputs: the same in standard deviations of the training record.
         observations: y (n,) of one output, (n, n_y) of several [output]; NaN where missing.
+        around: inputs before and after it, where they are known: late ones come from there.
     """
 
     record: Record
@@ -35,16 +46,39 @@ class PreparedRecord:
     inputs: Tensor
     scaled_inputs: Tensor
     observations: Tensor
+    around: Surroundings | None = None
 
     @classmethod
     def of(cls, record: Record, scaling: Scaling) -> PreparedRecord:
         """From a record that is known to fit the model, its channels made."""
         signals, grid = record.tensors(), time_grid(record.time)
-        scaled = _scaled(signals.inputs, scaling)
+        scaled = scaled_inputs(signals.inputs, scaling)
         return cls(record, scaling, grid, signals.inputs, scaled, signals.observations)
 
     def __len__(self) -> int:
         return len(self.record)
+
+    @property
+    def begun(self) -> PreparedRecord:
+        """From its first measured output on, with all inputs around it.
+
+        As the density of a model with free dead times has it: what acted before the record is not
+        in it, and nothing is known of the state until all that has arrived.
+        """
+        measured = ~torch.isnan(self.observations).reshape(len(self), -1).all(-1)
+        first = int(measured.to(torch.int8).argmax())
+        if not first:
+            return self
+        time, inputs, before = self.around or (self.grid.time, self.inputs, 0)
+        return PreparedRecord(
+            self.record[first:],
+            self.scaling,
+            time_grid(self.grid.time[first:]),
+            self.inputs[first:],
+            self.scaled_inputs[first:],
+            self.observations[first:],
+            Surroundings(time, inputs, before + first),
+        )
 
     @property
     def has_outputs(self) -> bool:
@@ -62,8 +96,8 @@ class PreparedRecord:
 Records = Record | Sequence[Record] | Sequence[PreparedRecord]
 
 
-def _scaled(inputs: Tensor, scaling: Scaling) -> Tensor:
-    """Inputs (n, n_u) in standard deviations of the training record."""
+def scaled_inputs(inputs: Tensor, scaling: Scaling) -> Tensor:
+    """Inputs (*b, n, n_u) in standard deviations of the training record."""
     if not inputs.shape[-1]:
         return inputs
     return (inputs - as_tensor(scaling.input_offset)) / as_tensor(scaling.input_scale)

@@ -82,7 +82,7 @@ class ModesPrior:
       input are normal around zero with a size of their own, unknown (`SharedScaleNormal`): pairs
       that are not needed shrink, as do inputs that have no effect; a slow pair may have gains of
       ten.
-    - ``feedthrough`` (n_y, n_u) or (n_u,)*: normal(0, 1).
+    - ``feedthrough`` (n_y, n_d) or (n_d,)*: normal(0, 1), of the inputs with a direct path.
     - ``noise_gain_local_scale`` (P,), ``noise_gain_unit`` (P, n_l, 2)*: horseshoe of scale 0.1 on
       n1 and n0 of the noise's sections (n1 s + n0 |lambda|) sqrt(4 r) / (...), r the typical rate
       of the record: the standard deviation of the output of a pair that decays at that rate. The
@@ -108,6 +108,8 @@ class ModesPrior:
         noise: "shared" or "independent", see `Modes`.
         feedthrough: whether there is a direct path D.
         fed: how many of the inputs, the last ones, come back and have no direct path.
+        late: columns of inputs whose dead time is a parameter: with a direct path a later first
+            effect and another dead time would be the same, and they have none.
         integrators: 1 for an integrator of each output, else 0.
         process_noise: whether there is process noise at all.
         time_scale: step and duration of the record [s].
@@ -131,6 +133,7 @@ class ModesPrior:
     priors: PriorName = "default"
     fed: int = 0
     integrators: int = 0
+    late: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         verify_fields(self)
@@ -162,10 +165,11 @@ class ModesPrior:
             )
             over = named("pair", "input", "term")
             sites.append(Site(f"{name}_input_gain", gain, over, growth=0.0))
-            if self.feedthrough and n_u > self.fed:
-                direct_inputs = n_u - self.fed
+            if self.feedthrough and self._prompt:
+                direct_inputs = len(self._prompt)
                 shape = (direct_inputs,) if self.outputs is None else (self.outputs, direct_inputs)
                 across = dims.get("direct", dims.get("input", "input"))
+                across = "prompt input" if self.late else across
                 over = (across,) if self.outputs is None else (*named("output"), across)
                 direct = _normal(FLAT if flat else 1.0, *shape)
                 sites.append(Site(f"{name}_feedthrough", direct, over, growth=0.0))
@@ -193,6 +197,11 @@ class ModesPrior:
                 prior, over = _normal(wide, n_y, self.brownian), named("output", "brownian")
                 sites.append(Site(f"{name}_integrator_noise", prior, over))
         return tuple(sites)
+
+    @property
+    def _prompt(self) -> list[int]:
+        """Columns of inputs with a direct path, where there is any."""
+        return [column for column in range(self.inputs - self.fed) if column not in self.late]
 
     def _pole_sites(self, dims: tuple[str, ...]) -> tuple[Site, Site]:
         low, high = self.time_scale.rate_bounds
@@ -234,8 +243,9 @@ class ModesPrior:
         if self.integrators:
             poles, B, c, L, drift = self._with_integrators(values, poles, B, c, L)
         D = values.get(f"{name}_feedthrough")
-        if D is not None and self.fed:
-            D = torch.nn.functional.pad(D, (0, self.fed))
+        if D is not None and len(self._prompt) < self.inputs:
+            whole = D.new_zeros((*D.shape[:-1], self.inputs))
+            D = whole.index_copy(-1, torch.tensor(self._prompt), D)
         return Modes(poles, B, c, L, D, noise=self.noise, drift=drift)
 
     def _with_integrators(

@@ -7,11 +7,12 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, Self, TypedDict, cast, get_args
 
-from pyro_dynogp.data.channels import Channel, count_direct, prepared
+from pyro_dynogp.data.channels import Channel, Delayed, count_direct, prepared
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.records import as_records
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.layers.noise import Gaussian, Likelihood
+from pyro_dynogp.models.arrival import free_delays
 from pyro_dynogp.models.prepared import PreparedRecord, Records
 from pyro_dynogp.models.priors import PriorName
 from pyro_dynogp.models.wiring import INPUTS, Dynamic, Known, Layer, StaticLayer, Wire, wire
@@ -74,6 +75,7 @@ class Structure:
         one_of(get_args(Integrate)).check("integrate", self.integrate)
         one_of(get_args(InitialState)).check("initial_state", self.initial_state)
         whole(count_direct(self.channels), self.inputs).check("direct", self.direct)
+        free_delays(self.channels)  # refuses what is made from them
         end = self.output_wire.layer  # placing the layers refuses those that do not fit together
         if self.has_feedback:
             _check_feedback(self.integrate, self.likelihood)
@@ -108,6 +110,11 @@ class Structure:
             return wire.name
         sees = isinstance(wire.layer, Known) and (wire.channels, self.outputs) == (1, 1)
         return wire.sources[0] if sees and wire.sources != (INPUTS,) else None
+
+    @property
+    def late(self) -> tuple[Delayed, ...]:
+        """Channels whose dead time is a parameter, an entry of the site ``delay``."""
+        return free_delays(self.channels)
 
     @property
     def has_feedback(self) -> bool:

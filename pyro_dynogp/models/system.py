@@ -17,6 +17,7 @@ from pyro_dynogp.lti.grid import TimeGrid, time_grid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import Response, mean_response
 from pyro_dynogp.lti.state import ModalState
+from pyro_dynogp.models.arrival import Delays
 from pyro_dynogp.models.known import KnownFunction
 from pyro_dynogp.models.past_inputs import initial_mean, past_input_covariance, with_direct
 from pyro_dynogp.models.wiring import INPUTS, Wire
@@ -133,6 +134,8 @@ class System:
         wires: how they are connected. layers: a system for each wire.
         noise: measurement noise. offset: (*b, n_y), or None where a static layer comes last.
         direct: (*b, n_y, K) weights of the last K inputs, which act on the output at once.
+        delays: dead times of inputs that are parameters; None for none. Inputs that methods take
+            are those that have arrived.
     """
 
     wires: tuple[Wire, ...]
@@ -140,6 +143,7 @@ class System:
     noise: Noise
     offset: Tensor | None
     direct: Tensor | None = None
+    delays: Delays | None = None
     _in_units: tuple[Scaling, PhysicalSystem] | None = field(default=None, init=False, repr=False)
 
     @cached_property
@@ -150,6 +154,8 @@ class System:
             shapes.append(self.offset.shape[:-1])
         if self.direct is not None:
             shapes.append(self.direct.shape[:-2])
+        if self.delays is not None:
+            shapes.append(self.delays.values.shape[:-1])
         for layer in self.layers:
             if isinstance(layer, DynamicSystem):
                 shapes.append(layer.modes.batch_shape)

@@ -164,7 +164,7 @@ def _names(layers: Sequence[Layer]) -> list[str]:
     for place, (letter, layer) in enumerate(zip(letters, layers, strict=True)):
         number = "" if letters.count(letter) == 1 else str(letters[: place + 1].count(letter))
         names.append(layer.name or letter + number)
-    reserved = {INPUTS, "y", "offset", "noise_sd", "log_noise"}
+    reserved = {INPUTS, "y", "offset", "noise_sd", "log_noise", "delay"}
     reserved |= {n + HIDDEN for n, layer in zip(names, layers, strict=True) if _hidden(layer)}
     if len(set(names)) < len(names) or set(names) & reserved:
         raise invalid(

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.models.arrival import arriving
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.models.system import DynamicSystem
@@ -90,7 +91,8 @@ def static_function(
         raise invalid("channel", expected=f"0 to {wire.channels - 1}", got=repr(channel))
     along = prepared(fit, record)
     found = {k: v.mean for k, v in trajectories(fit, along).items()}
-    found["inputs"] = fit.system.driving(along.scaled_inputs).numpy()
+    driving = fit.system.driving(arriving(along, fit.system.delays)[1])
+    found["inputs"] = driving.reshape(-1, *driving.shape[-2:]).mean(0).numpy()
     seen = np.concatenate([found[source] for source in wire.sources], -1)
     low, high = seen[:, channel].min(), seen[:, channel].max()
     margin = 0.1 * (high - low)

@@ -10,6 +10,7 @@ import torch
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.models.draws import variance_multiples
 from pyro_dynogp.models.exact_outputs import ExactOutputs, spread_evenly
+from pyro_dynogp.models.late_systems import arrive
 from pyro_dynogp.models.output_process import OutputProcess, flat
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.prepared import PreparedRecord, with_outputs
@@ -53,14 +54,15 @@ def forecast(
     with_outputs([earlier], "past")
     with torch.no_grad():
         before = output_process(beginning(fit, earlier, predicting=True), earlier)
+        next_inputs = arrive(fit.system, later).inputs[..., 0, :]
         start = before.state_after(
-            earlier.observations, gap, later.inputs[0], process_noise=process_noise
+            earlier.observations, gap, next_inputs, process_noise=process_noise
         )
         # Noise that follows the output continues from where the past has brought the output.
         time = np.append(past.time, past.time[-1] + gap + (future.time - future.time[0]))
         system = fit.system if process_noise else fit.system.without_process_noise
         outputs = output_process(system, later, start=start)
-        inputs = torch.cat([before.scaled_inputs, outputs.scaled_inputs])
+        inputs = torch.cat([before.scaled_inputs, outputs.scaled_inputs], -2)
         outputs.noise_sd = before.system.noise_sd(inputs, time)[..., len(past) :, :]
         return _forward(fit, later, outputs, samples, seed, "forecast")
 

@@ -6,10 +6,11 @@ import dataclasses
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.records import one_record
-from pyro_dynogp.models.prepared import PreparedRecord
+from pyro_dynogp.models.prepared import PreparedRecord, Surroundings
 from pyro_dynogp.support.errors import invalid
 
 if TYPE_CHECKING:
@@ -42,11 +43,26 @@ def following(
     for argument, record in (("past", past), ("future", future)):
         one_record(record, "Forecast several records one after the other.", argument)
     gap = gap_between(past, future)
+    before, after = _together(fit, past, future, gap)
+    if not fit.model.late:
+        return before, after, gap
+    shift = future.time[0] - past.time[-1] - gap
+    time = torch.cat([before.grid.time, after.grid.time - shift])
+    inputs = torch.cat([before.inputs, after.inputs])
+    before = dataclasses.replace(before, around=Surroundings(time, inputs, 0))
+    after = dataclasses.replace(after, around=Surroundings(time, inputs, len(before)))
+    return before, after, gap
+
+
+def _together(
+    fit: Fitted, past: Record, future: Record, gap: float
+) -> tuple[PreparedRecord, PreparedRecord]:
+    """Both as the model sees them, channels made from one record of the two where they can be."""
     before, after = prepared(fit, past), prepared(fit, future)
     if not fit.model.channels or set(future.input_names) != set(past.input_names):
-        return before, after, gap
+        return before, after
     if before.record.input_names == past.input_names:  # prepared before they were split
-        return before, after, gap
+        return before, after
     first, second = (
         part.with_outputs(np.zeros((len(part), 0)), names=(), units=()) for part in (past, future)
     )
@@ -56,7 +72,7 @@ def following(
         PreparedRecord.of(dataclasses.replace(part.record, inputs=u), part.scaling)
         for part, u in zip((before, after), inputs, strict=True)
     )
-    return before, after, gap
+    return before, after
 
 
 def joined(first: Record, second: Record, shift: float = 0.0) -> Record:

@@ -20,6 +20,7 @@ UNEVEN = dgp.Record(ONE.time + 0.2 * ONE.time**2, ONE.inputs, ONE.outputs)
 BOTH = dgp.Record(ONE.time, np.concatenate([ONE.inputs, ONE.inputs[::-1] ** 2], 1), ONE.outputs)
 NONE = dgp.Record(ONE.time, None, ONE.outputs)
 HALF = TWO.with_outputs(np.where(np.arange(60).reshape(30, 2) % 5 == 3, np.nan, TWO.outputs))
+LATE = dgp.Delayed("u", median=0.4)  # four steps
 Linear = dgp.LinearDynamicGP
 CASES = {
     "one pair": (Linear(1, pairs=1), ONE),
@@ -43,6 +44,14 @@ CASES = {
     "direct": (Linear(2, pairs=1, direct=1, channels=(Trend(0.0, 4.0),)), ONE),
     "direct alone": (Linear(1, pairs=1, direct=1), ONE),
     "two records": (Linear(1, pairs=1), (ONE, GAPS[:25])),
+    "late": (Linear(1, pairs=2, channels=(LATE,)), GAPS),
+    "late, integrator": (Linear(1, pairs=2, integrators=1, channels=(LATE,)), ONE),
+    "one of two late": (Linear(2, pairs=2, channels=(dgp.Delayed("u2"),)), BOTH),
+    "two late": (Linear(2, pairs=1, channels=(dgp.Delayed("u2"), dgp.Delayed("u1"))), BOTH),
+    "late at once": (Linear(2, pairs=1, direct=1, channels=(dgp.Delayed("u2"),)), BOTH),
+    "late and direct": (Linear(2, pairs=1, direct=1, channels=(LATE, Trend(0.0, 4.0))), ONE),
+    "late, two outputs": (Linear(1, outputs=2, pairs=2, channels=(LATE,)), HALF),
+    "late, two records": (Linear(1, pairs=1, channels=(LATE,)), (ONE, GAPS[:25])),
 }
 # What the torch path keeps to itself.
 OTHERS = {
@@ -50,6 +59,7 @@ OTHERS = {
     "at rest": (Linear(1, pairs=2, initial_state="zero"), ONE),
     "Student-t": (Linear(1, pairs=2, likelihood=dgp.StudentT()), ONE),
     "varying noise": (Linear(1, pairs=2, likelihood=dgp.Heteroscedastic()), ONE),
+    "late on uneven steps": (Linear(1, pairs=2, channels=(LATE,)), UNEVEN),
     "Wiener": (dgp.Wiener(1, pairs=2, inducing=5), ONE),
 }
 
@@ -109,7 +119,9 @@ def test_other_models_go_through_torch(name):
     assert linear_density(drawn(name)[0].log_density) is None
 
 
-@pytest.mark.parametrize("name", ["three pairs", "two outputs, integrators", "missing samples"])
+@pytest.mark.parametrize(
+    "name", ["three pairs", "two outputs, integrators", "missing samples", "two late"]
+)
 def test_a_point_has_the_same_bits_in_any_batch(name):
     potential, _ = drawn(name)
     lean = linear_density(potential.log_density)

@@ -45,7 +45,7 @@ def counts(monkeypatch):
         monkeypatch.setattr(owner, name, call)
 
     counted(Structure, "check", "checked")
-    counted(prepared, "_scaled", "scaled")
+    counted(prepared, "scaled_inputs", "scaled")
     counted(TimeGrid, "__init__", "grid")
     counted(Record, "tensors", "tensors")
     counted(Scaling, "from_records", "learnt")

@@ -168,6 +168,9 @@ TABLE: dict[str, Entry] = {
     "Model": plain(dgp.Model, {"inputs": NUMBER, "layers": ((), ("g",), (3,), "g", None), **OPTIONS,
                    "channels": (("a",), 3), "scaling": ("a", 3)}, inputs=1,
                    layers=(dgp.Dynamic(pairs=1),)),
+    "Delayed": plain(dgp.Delayed, {"channel": (3, None),
+                     "delay": ("a", np.nan, np.inf, True, [1.0]), "median": (*POSITIVE, [1.0])},
+                     channel="u"),
     "Dynamic": plain(of_model(dgp.Dynamic, pairs=1), {
         "outputs": COUNT, "pairs": COUNT, "noise": NAME, "brownian": COUNT, "feedthrough": SWITCH,
         "process_noise": SWITCH, "integrators": BOTH, "skip": (("g",), "inputs", 3),

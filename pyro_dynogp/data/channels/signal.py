@@ -11,7 +11,9 @@ import numpy as np
 from pyro_dynogp.data.channels.base import Channel, Quantity, signal_of, unit_of
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.signals import dead_zone, delayed, play
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import POSITIVE, between, instance, invalid
+
+FINITE = between(-np.inf, np.inf, "a finite number [time unit], or none")
 
 
 @dataclass(frozen=True)
@@ -47,23 +49,79 @@ class Replacement(Channel):
 
 @dataclass(frozen=True)
 class Delayed(Replacement):
-    """An input that arrives later: u(t - delay), held between samples, averaged over each step.
+    """An input that arrives later: u(t - delay), held between samples.
 
-    Before the record its first value is held, which is not what acted then: `close_loop` takes
-    outputs for missing until the first input of the record has arrived, and in a record for `fit`
-    they had better be NaN. Exact for whole numbers of steps; between them right for systems that
-    are slow beside a step.
+    Without a number the dead time is a parameter with a posterior, an entry of the site ``delay``
+    of the model, which `fit` estimates: fractions of a sample, too. Its prior is half-Cauchy,
+
+        p(d) = 2 / (pi m (1 + (d / m)^2)),   d >= 0,
+
+    with the median m = sqrt(step * duration / pi), between the fastest and the slowest rates that
+    the record can show: 3 samples of 30, 10 of 300, 18 of 1000. It is level near zero, and beyond m
+    it falls as 1/d^2 alone, so that a few changes of the input say more than it does. The first
+    dynamic layer has no direct path (`feedthrough`) for the input: an effect that begins a step
+    later and another dead time would be one and the same. The output of a plant that answers within
+    a step moves at the next sample, and its dead time comes out up to a step shorter.
+
+    Before the record its first value is held, which is not what acted then. `fit` of a model with a
+    free dead time, and `close_loop`, take outputs for missing until the first input of the record
+    has arrived; with a given delay they had better be NaN in a record for `fit`.
+
+    A given delay averages the input over each step: exact for whole numbers of steps; between them
+    right for systems that are slow beside a step. A free one is exact for a dynamic layer that sees
+    the inputs, at any fraction (`models.late_systems`); for others it averages, too.
 
     Args:
-        channel: name of the input. delay: [time unit], may be a fraction of a step.
+        channel: name of the input.
+        delay: dead time [time unit], may be a fraction of a step; None where data are to say it.
+        median: of the prior of a dead time that data are to say [time unit]; None for the above.
+
+    Raises:
+        ValueError: where `delay` or `median` is no number, or both are given.
+
+    Example:
+        >>> import numpy as np, pyro_dynogp as dgp
+        >>> rng = np.random.default_rng(0)
+        >>> u, y = np.repeat(rng.normal(size=20), 6), np.zeros(120)
+        >>> for k in range(4, 120):
+        ...     y[k] = 0.8 * y[k - 1] + 0.2 * u[k - 4]  # held inputs, three steps late
+        >>> record = dgp.Record(3.0 * np.arange(120), u, y + 0.02 * rng.normal(size=120),
+        ...                     input_names=("u",), time_unit="s")
+        >>> model = dgp.LinearDynamicGP(inputs=1, pairs=1, channels=(dgp.Delayed("u"),))
+        >>> fit = dgp.fit(model, record, progress=False)
+        >>> round(float(fit.draws["delay"].mean()))  # fit.summary() has it with its spread
+        9
     """
 
     label: ClassVar[str] = "delayed"
     numbers: ClassVar[Mapping[str, Quantity]] = {"delay": Quantity("dead time", "time", 0.0)}
-    delay: float
+    delay: float | None = None
+    median: float | None = None
+
+    def __post_init__(self) -> None:
+        instance("channel", self.channel, str)
+        if self.delay is not None:
+            FINITE.check("delay", self.delay)
+        if self.median is not None:
+            POSITIVE.check("median", self.median)
+            if self.delay is not None:
+                raise invalid(
+                    "median",
+                    expected="None where the delay is given",
+                    got=repr(self.median),
+                    advice="It is of the prior of a dead time that is not known: leave delay out.",
+                )
+
+    @property
+    def free(self) -> bool:
+        """Whether the dead time is a parameter of the model."""
+        return self.delay is None
 
     def _columns(self, record: Record) -> np.ndarray:
-        return delayed(signal_of(record, self.channel), record.time, self.delay)
+        signal = signal_of(record, self.channel)
+        if self.delay is None:  # the model delays it
+            return signal
+        return delayed(signal, record.time, self.delay)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.posteriors import Posterior
 from pyro_dynogp.inference.run import Run
+from pyro_dynogp.inference.starts.delays import without_unknown
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord, as_measured
 from pyro_dynogp.support.errors import invalid
@@ -42,6 +43,8 @@ class Problem:
     ) -> Problem:
         """Records checked and prepared, the model in their units; `start` is a fit to start from.
 
+        Of a model with free dead times outputs are missing until inputs are likely to have arrived.
+
         Raises:
             ValueError: as of `Model.check`; on constant or entirely missing signals.
         """
@@ -52,6 +55,8 @@ class Problem:
             raise invalid("record", expected=expected, got=f"{longest} samples")
         scaling = Scaling.from_records(checked)
         prepared = tuple(PreparedRecord.of(record, scaling) for record in checked)
+        if model.late:
+            prepared = without_unknown(model, prepared)
         learnt = None if start is None else dict(start.mode)
         return cls(replace(model, scaling=scaling), prepared, learnt)
 

@@ -26,6 +26,7 @@ from pyro_dynogp.inference.optimise.maximum import (
 )
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.run import Run
+from pyro_dynogp.inference.starts.delays import moved
 from pyro_dynogp.inference.starts.plans import (
     RANDOM,
     Plan,
@@ -161,6 +162,8 @@ def best_optima(
             starts = [grown(learnt, starts[0]), *starts]
         steps = steps or STEPS[optimizer]
         optima = maximise(problem.target, records, starts, run, steps=steps, optimizer=optimizer)
+        if model.late:
+            optima = _with_others_around(problem, optima, run, optimizer, steps)
     else:
         optimizer = optimizer or optimizer_for(model)
         optima = cascade_optima(problem, run, optimizer, steps or FUNCTION_STEPS[optimizer])
@@ -170,6 +173,18 @@ def best_optima(
             "record for jumps of many orders of magnitude, or try fewer pairs."
         )
     return optima
+
+
+def _with_others_around(
+    problem: Problem, optima: list[Optimum], run: Run, optimizer: Optimizer, steps: int
+) -> list[Optimum]:
+    """The optima, and those climbed to from the best one with other dead times, best first."""
+    starts = moved(optima[0].values, float(problem.scaling.time_step))
+    found = maximise(
+        problem.target, problem.records, starts, run, steps=steps, optimizer=optimizer,
+        key="delay", effort=Effort(near=True),
+    )  # fmt: skip
+    return sorted([*optima, *found], key=lambda one: one.energy)
 
 
 def cascade_optima(problem: Problem, run: Run, optimizer: Optimizer, steps: int) -> list[Optimum]:

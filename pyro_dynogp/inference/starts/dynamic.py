@@ -85,7 +85,7 @@ class DynamicStart:
             values[self._key("input_gain")] = (
                 values[self._key("input_gain")] * length[:, None, None]
             )
-            if layer.feedthrough:
+            if self._key("feedthrough") in values:
                 D = values[self._key("feedthrough")]
                 rest = self._random(layer.width - 1, D.shape[-1], scale=0.1)
                 values[self._key("feedthrough")] = torch.cat([D.reshape(1, -1), rest])
@@ -138,9 +138,10 @@ class DynamicStart:
         if d + self.one.fed:
             values[self._key("input_gain")] = self._random(P, d + self.one.fed, 2)
         if d:
-            if layer.feedthrough:
-                D = torch.eye(layer.width, d, dtype=torch.float64)
-                D = D + self._random(layer.width, d)
+            shape = self._direct_shape()
+            if shape is not None:
+                D = torch.eye(layer.width, shape[-1], dtype=torch.float64)
+                D = D + self._random(layer.width, shape[-1])
                 values[self._key("feedthrough")] = D if several else D[0]
             else:  # the fastest pair passes the first input on
                 fastest = int(np.argmax(np.abs(poles)))
@@ -152,6 +153,11 @@ class DynamicStart:
         if layer.process_noise:
             values.update(self._small_noise())
         return values
+
+    def _direct_shape(self) -> torch.Size | None:
+        """Shape of the site of direct paths; None where there is none."""
+        sites = self.model.sites(self.scaling)
+        return next((x.shape for x in sites if x.name == self._key("feedthrough")), None)
 
     def _small_noise(self) -> Values:
         layer = self.layer
@@ -167,8 +173,7 @@ class DynamicStart:
     def response(self, values: Values, record: PreparedRecord, x: Tensor) -> Tensor:
         """Mean trajectory (n, w) of the layer."""
         with torch.no_grad():
-            time_scale = TimeScale.of(self.scaling)
-            layer = self.model.dynamic_system(self.one, self.layer, values, time_scale)
+            layer = self.model.dynamic_system(self.one, self.layer, values, self.scaling)
             silent = x.new_zeros((*x.shape[:-1], self.one.fed))
             return layer.mean(torch.cat([x, silent], -1), record.grid)
 

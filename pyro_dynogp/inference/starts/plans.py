@@ -13,12 +13,14 @@ from torch import Tensor
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.optimise.maximum import maximise, optimizer_for
 from pyro_dynogp.inference.run import Run
+from pyro_dynogp.inference.starts.delays import delayed_starts, with_delays
 from pyro_dynogp.inference.starts.dynamic import DynamicStart, Values
 from pyro_dynogp.inference.starts.poles import starting_values
 from pyro_dynogp.inference.starts.static import start_static
 from pyro_dynogp.inference.starts.subspace import subspace_starts
 from pyro_dynogp.layers.noise import TYPICAL
 from pyro_dynogp.models.architectures import LinearDynamicGP
+from pyro_dynogp.models.arrival import DELAY
 from pyro_dynogp.models.assembly import assemble
 from pyro_dynogp.models.known import known_function, known_sites, middle_of
 from pyro_dynogp.models.model import Model
@@ -47,6 +49,7 @@ def linear_twin(model: Model, layer: Dynamic, scaling: Scaling) -> Model:
         brownian=layer.brownian,
         feedthrough=layer.feedthrough,
         process_noise=(layer.process_noise and not layer.feedback) or model.inputs == model.direct,
+        channels=model.late,
         scaling=scaling,
     )
 
@@ -131,6 +134,8 @@ def starting_point(model: Model, records: Sequence[PreparedRecord], plan: Plan) 
     generator = np.random.default_rng(plan.seed)
     values: Values = {}
     scaling = records[0].scaling
+    if model.late:
+        values[DELAY], records = with_delays(model, records, plan.linear)
     inputs = [record.scaled_inputs for record in records]
     driving = model.inputs - model.direct
     signals = [{INPUTS: u[:, :driving]} for u in inputs]
@@ -313,10 +318,14 @@ def linear_starts(
 ) -> list[Values]:
     """Starts of a linear model: of subspace identification and with random poles, in turn.
 
+    Of a model with free dead times those of `delayed_starts`, as many in all.
+
     Args:
         model: the model. records: to which it is fitted. seed: of random poles.
         count: how many; None for `RANDOM` of each kind, as far as there are orders.
     """
+    if model.late:
+        return delayed_starts(model, records, count or 2 * RANDOM, seed)
     subspace = subspace_starts(model, records, seed)[:RANDOM]
     random = starting_values(model, records, count=count or RANDOM, seed=seed)
     both = [one for pair in zip_longest(subspace, random) for one in pair if one is not None]
