@@ -21,6 +21,10 @@ def test_a_spring_forecasts_where_a_line_does_not(found):
     assert found["errors"]["spring"] < 0.2 * found["errors"]["line"]
 
 
+def test_a_hidden_signal_forecasts_within_the_noise(found):
+    assert found["errors"]["hidden"] < 0.02  # of which the noise is as much
+
+
 def test_known_functions_forecast_near_the_noise(found):
     assert found["errors"]["friction"] < 0.03
     assert found["errors"]["tank"] < 0.01

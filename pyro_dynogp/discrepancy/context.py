@@ -13,8 +13,7 @@ from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.blocks import Blocks, shared
 from pyro_dynogp.discrepancy.decision import Confirmed, confirm
-from pyro_dynogp.discrepancy.held_out import forecast_density, forecast_errors, without
-from pyro_dynogp.discrepancy.judged import certain
+from pyro_dynogp.discrepancy.held_out import certain, forecast_density, forecast_errors, without
 from pyro_dynogp.discrepancy.residuals import residuals_of
 from pyro_dynogp.discrepancy.search import Found, look, rated
 from pyro_dynogp.effects import Effect

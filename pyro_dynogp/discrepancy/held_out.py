@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import logsumexp
 
+from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.criticism.densities import pointwise_log_density
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.effects.base import Score
 from pyro_dynogp.fitting import Fit
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.prediction.first_state import beginning
+from pyro_dynogp.statistics.settings import LoopSettings
 
 
 def without(record: Record, fold: np.ndarray) -> Record:
@@ -80,6 +82,12 @@ def one_step_density(fit: Fit, record: Record) -> np.ndarray:
     outputs = output_process(beginning(fit, along, predicting=True), along)
     each = pointwise_log_density(outputs, along.observations, "forecast")
     return logsumexp(each, axis=0) - np.log(len(each))
+
+
+def certain(gains: np.ndarray, settings: LoopSettings) -> bool:
+    """Whether gains (N,) of single samples are certainly more than nothing in all [nats]."""
+    error = settings.standard_errors * block_standard_error(gains)[0]
+    return bool(gains.sum() > max(settings.gain, error))
 
 
 def stretches(mask: np.ndarray) -> list[slice]:

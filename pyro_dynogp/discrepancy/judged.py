@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from pyro_dynogp.criticism.comparison import block_standard_error
+from pyro_dynogp.discrepancy.held_out import certain
 from pyro_dynogp.discrepancy.result import Attempt, Decision
 from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.discrepancy.trials import Tried
@@ -88,12 +89,6 @@ def enough_samples(gain: float, error: float, count: int, settings: LoopSettings
     wanted = count * max((settings.standard_errors * error / gain) ** 2, settings.gain / gain)
     digit = 10 ** max(int(np.log10(wanted)) - 1, 0)
     return int(np.ceil(wanted / digit)) * digit
-
-
-def certain(gains: np.ndarray, settings: LoopSettings) -> bool:
-    """Whether gains (N,) of single samples are certainly more than nothing in all."""
-    error = settings.standard_errors * block_standard_error(gains)[0]
-    return bool(gains.sum() > max(settings.gain, error))
 
 
 def loss_of(errors: np.ndarray, base: np.ndarray) -> np.ndarray:

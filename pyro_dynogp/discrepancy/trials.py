@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.discrepancy.held_out import held_out_density, scored, without
+from pyro_dynogp.discrepancy.held_out import certain, held_out_density, scored, without
 from pyro_dynogp.discrepancy.rehearsal import lasting
 from pyro_dynogp.effects.base import Compared, Score
 from pyro_dynogp.fitting import Fit
@@ -155,7 +155,7 @@ def _finer(trial: Trial, model: Model, training: Record, times: int) -> Sequence
 
 
 def _best_ahead(trial: Trial, training: Record) -> Fit:
-    """The first variant that does as well as the best on the data held out.
+    """The first variant, or a later one that is certainly better on the data held out.
 
     Where they differ in how they extrapolate what is right in one stretch may be luck: of those
     that are rehearsed only those count whose forecasts are no worse than those of the base held at
@@ -166,9 +166,13 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
     kept = fits
     if trial.compared == "rehearsed":
         kept = lasting(fits, trial.base, trial.record, fold, trial.run, settings) or fits[-1:]
-    sums = [held_out_density(f, trial.record, fold, trial.score).sum() for f in kept]
-    least = max(sums) - settings.gain
-    return next(f for f, total in zip(kept, sums, strict=True) if total >= least)
+    best, *others = kept
+    density = held_out_density(best, trial.record, fold, trial.score)
+    for one in others:
+        own = held_out_density(one, trial.record, fold, trial.score)
+        if certain(own - density, settings):
+            best, density = one, own
+    return best
 
 
 def _unscaled(fit: Fit) -> Model:

@@ -54,8 +54,8 @@ class Effect:
         localised: whether it happens at one instant, so that refits are scored on blocks of the
             whole record rather than after it.
         compared: on which data its variants are: those that are fitted to; those held out, where
-            the first is kept that is as good as the best; or "rehearsed", for variants that differ
-            in how they extrapolate: held out, of those whose forecasts last (`rehearsal`).
+            the first is kept, or a later one that is certainly better; or "rehearsed", for variants
+            that differ in how they extrapolate: held out, of those whose forecasts last.
         absorbs_structure: whether its block takes up whatever else a model lacks, so that a search
             begins without it.
         experiments: by name of another effect, the experiment that tells the two apart. One of

@@ -13,7 +13,7 @@ from pyro_dynogp.data.signals import hermite, hinges
 from pyro_dynogp.effects.base import Effect, Parameters
 from pyro_dynogp.lti.views import steady_state_gain
 from pyro_dynogp.models.system import DynamicSystem
-from pyro_dynogp.models.variants import FEEDBACK, Model, with_feedback
+from pyro_dynogp.models.variants import Model, with_feedback
 from pyro_dynogp.models.wiring import HIDDEN
 from pyro_dynogp.statistics.detecting import lasting
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
@@ -82,7 +82,7 @@ class NonlinearFeedbackOfOutput(Effect):
     """A function that acts back on the dynamics: spring, friction, outflow.
 
     Of the output, of a signal of the same states that nothing measures (a velocity, the level of
-    another tank), or one of each; the first of them that forecasts as well as the best is kept.
+    another tank), or one of each; a later one of them only where it is certainly better.
     """
 
     name = "nonlinear feedback"
@@ -130,9 +130,11 @@ class NonlinearFeedbackOfOutput(Effect):
         """
         model, scaling = fit.model, fit.scaling
         fed = [wire for wire in model.wires if wire.feedback]
-        if model.outputs > 1 or len(fed) != 1 or fed[0].feedback != (FEEDBACK,) or not fed[0].last:
+        if model.outputs > 1 or len(fed) != 1 or len(fed[0].feedback) != 1 or not fed[0].last:
             return {}
         system, (name,) = fit.system_at(fit.draws), fed[0].feedback
+        if len(fed[0].signals) > 1:  # what it sees is hidden
+            return {}
         dynamic, function = system.layer(fed[0].name), system.layer(name)
         assert isinstance(dynamic, DynamicSystem)
         assert not isinstance(function, DynamicSystem)

@@ -29,7 +29,8 @@ from pyro_dynogp.inference.posteriors import Mixture, Sampled, draws_of_guide
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.dynamic import Values
 from pyro_dynogp.inference.starts.extended import extended_starts
-from pyro_dynogp.inference.starts.plans import linear_starts, starting_points
+from pyro_dynogp.inference.starts.linear import linear_starts
+from pyro_dynogp.inference.starts.plans import starting_points
 from pyro_dynogp.inference.starts.poles import grown
 from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
 from pyro_dynogp.models.model import Model

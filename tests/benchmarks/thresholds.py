@@ -23,7 +23,8 @@ import pyro_dynogp as dgp
 from pyro_dynogp import LoopSettings
 from pyro_dynogp.discrepancy import context, decision, search, state
 from pyro_dynogp.discrepancy import refits as refitting
-from pyro_dynogp.discrepancy.judged import certain, loss_of
+from pyro_dynogp.discrepancy.held_out import certain
+from pyro_dynogp.discrepancy.judged import loss_of
 from tests.benchmarks.markdown import table
 from tests.benchmarks.planted import Case, study
 

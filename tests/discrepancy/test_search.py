@@ -12,8 +12,7 @@ from scipy import stats
 import pyro_dynogp as dgp
 from pyro_dynogp import effects
 from pyro_dynogp.discrepancy.context import SearchContext
-from pyro_dynogp.discrepancy.held_out import without
-from pyro_dynogp.discrepancy.judged import certain
+from pyro_dynogp.discrepancy.held_out import certain, without
 from pyro_dynogp.discrepancy.search import Found, candidates_of, look, rated
 from pyro_dynogp.discrepancy.state import SearchState
 from pyro_dynogp.effects import Effect

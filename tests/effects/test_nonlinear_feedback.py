@@ -64,7 +64,7 @@ class TestDetection:
         r = self.seen(0, 1.0)
         found = nonlinear_feedback(r, SETTINGS)
         assert found.p_value < 1e-4
-        assert found.where == {"output": "y"}
+        assert found.where == {"output": "speed"}
         assert "acts back on its dynamics" in found.sentence
         # To first order the poles make the residual; a function at once explains less.
         assert found.gain > output_nonlinearity(r, SETTINGS).gain + 10.0

@@ -14,7 +14,8 @@ import pyro_dynogp as dgp
 from pyro_dynogp.guides.families import Point
 from pyro_dynogp.inference.methods.trajectory_guide import layer_guide
 from pyro_dynogp.inference.posteriors import Mixture
-from pyro_dynogp.inference.starts.plans import Plan, linear_twin, starting_point
+from pyro_dynogp.inference.starts.linear import linear_twin
+from pyro_dynogp.inference.starts.plans import Plan, starting_point
 from pyro_dynogp.inference.starts.poles import starting_values
 from tests.inference.cascades import FAST, same, wiener, wiener_record
 

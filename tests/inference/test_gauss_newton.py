@@ -17,7 +17,8 @@ from pyro_dynogp.inference.optimise.gauss_newton import (
 )
 from pyro_dynogp.inference.optimise.maximum import maximise, optimizer_for, optimizer_near
 from pyro_dynogp.inference.run import Run
-from pyro_dynogp.inference.starts.plans import linear_starts, starting_points
+from pyro_dynogp.inference.starts.linear import linear_starts
+from pyro_dynogp.inference.starts.plans import starting_points
 from pyro_dynogp.inference.starts.poles import starting_values
 from tests.inference.test_log_joint import GAPS, ONE, TWO, UNEVEN
 

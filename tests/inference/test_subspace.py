@@ -6,7 +6,7 @@ import torch
 
 import pyro_dynogp as dgp
 from pyro_dynogp.data.scaling import Scaling
-from pyro_dynogp.inference.starts.plans import RANDOM, linear_starts
+from pyro_dynogp.inference.starts.linear import RANDOM, linear_starts
 from pyro_dynogp.inference.starts.subspace import subspace_poles, subspace_starts
 from pyro_dynogp.models.prepared import PreparedRecord
 from tests.conftest import simulate_record

@@ -8,7 +8,8 @@ import torch
 import pyro_dynogp as dgp
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.run import Run
-from pyro_dynogp.inference.starts.plans import linear_starts, starting_points
+from pyro_dynogp.inference.starts.linear import linear_starts
+from pyro_dynogp.inference.starts.plans import starting_points
 
 Dynamic, Static, Known = dgp.Dynamic, dgp.Static, dgp.Known
 

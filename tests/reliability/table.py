@@ -160,7 +160,7 @@ TABLE: dict[str, Entry] = {
     "WienerHammerstein": plain(dgp.WienerHammerstein, {**CURVED, "width": COUNT}, inputs=1,
                                pairs=1),
     "HammersteinWiener": plain(dgp.HammersteinWiener, CURVED, inputs=1, pairs=1),
-    "NonlinearFeedback": plain(dgp.NonlinearFeedback, CURVED, inputs=1),
+    "NonlinearFeedback": plain(dgp.NonlinearFeedback, {**CURVED, "hidden": NUMBER}, inputs=1),
     "ParallelWienerHammerstein": plain(dgp.ParallelWienerHammerstein,
                                        {**CURVED, "branches": (*COUNT, None)}, inputs=1, pairs=1),
     "Cascade": plain(dgp.Cascade, {"inputs": NUMBER, "layers": ((), ["g"], [3], "g", None),
@@ -174,7 +174,7 @@ TABLE: dict[str, Entry] = {
     "Dynamic": plain(of_model(dgp.Dynamic, pairs=1), {
         "outputs": COUNT, "pairs": COUNT, "noise": NAME, "brownian": COUNT, "feedthrough": SWITCH,
         "process_noise": SWITCH, "integrators": BOTH, "skip": (("g",), "inputs", 3),
-        "sees": (("g",), "inputs", 3), "feedback": (("f",), "f", 3),
+        "sees": (("g",), "inputs", 3), "feedback": (("f",), "f", 3), "hidden": (*NUMBER, 1),
         "name": ("y", "inputs", 3, "a b")}),
     "Static": plain(of_model(dgp.Static), {
         "outputs": COUNT, "inducing": COUNT, "kernel": KERNEL, "mean": NAME,

@@ -27,15 +27,8 @@ from pyro_dynogp.inference.optimise.maximum import (
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.delays import moved
-from pyro_dynogp.inference.starts.plans import (
-    RANDOM,
-    Plan,
-    Values,
-    linear_starts,
-    linear_twins,
-    starting_point,
-    starts_of,
-)
+from pyro_dynogp.inference.starts.linear import RANDOM, linear_starts, linear_twins
+from pyro_dynogp.inference.starts.plans import Plan, Values, starting_point, starts_of
 from pyro_dynogp.inference.starts.poles import grown
 from pyro_dynogp.layers.noise import TYPICAL
 from pyro_dynogp.models.model import Model

@@ -9,13 +9,8 @@ import numpy as np
 
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.starts.dynamic import Values
-from pyro_dynogp.inference.starts.plans import (
-    Plan,
-    leading_layers,
-    linear_twin,
-    one_output,
-    starting_point,
-)
+from pyro_dynogp.inference.starts.linear import leading_layers, linear_twin, one_output
+from pyro_dynogp.inference.starts.plans import Plan, starting_point
 from pyro_dynogp.inference.starts.poles import grown, random_poles, values_given_poles
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord

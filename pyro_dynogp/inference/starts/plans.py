@@ -4,22 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import zip_longest
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from pyro_dynogp.data.scaling import Scaling
-from pyro_dynogp.inference.optimise.maximum import maximise, optimizer_for
 from pyro_dynogp.inference.run import Run
-from pyro_dynogp.inference.starts.delays import delayed_starts, with_delays
+from pyro_dynogp.inference.starts.delays import with_delays
 from pyro_dynogp.inference.starts.dynamic import DynamicStart, Values
-from pyro_dynogp.inference.starts.poles import starting_values
+from pyro_dynogp.inference.starts.linear import Twin, leading_layers, linear_twins
 from pyro_dynogp.inference.starts.static import start_static
-from pyro_dynogp.inference.starts.subspace import subspace_starts
 from pyro_dynogp.layers.noise import TYPICAL
-from pyro_dynogp.models.architectures import LinearDynamicGP
 from pyro_dynogp.models.arrival import DELAY
 from pyro_dynogp.models.assembly import assemble
 from pyro_dynogp.models.known import known_function, known_sites, middle_of
@@ -29,46 +24,6 @@ from pyro_dynogp.models.system import DynamicSystem, see
 from pyro_dynogp.models.wiring import INPUTS, Dynamic, Known, Static, Wire
 from pyro_dynogp.moments import filtering, smoothing
 from pyro_dynogp.support.parallel import child_seeds, seeded
-
-# Most starts of linear fits of each kind; iterations of those that come before cascades.
-RANDOM = 6
-LINEAR_STEPS = 40
-# A linear model, the records that it is fitted to, and its optima, best first.
-Twin = tuple[Model, Sequence[PreparedRecord], Sequence[Values]]
-
-
-def linear_twin(model: Model, layer: Dynamic, scaling: Scaling) -> Model:
-    """The linear model whose optimum starts a dynamic layer."""
-    return LinearDynamicGP(
-        inputs=model.inputs,
-        direct=model.direct,
-        outputs=layer.outputs if layer.outputs == model.outputs else 1,
-        pairs=layer.pairs,
-        integrators=layer.integrators,
-        noise=layer.noise,
-        brownian=layer.brownian,
-        feedthrough=layer.feedthrough,
-        process_noise=(layer.process_noise and not layer.feedback) or model.inputs == model.direct,
-        channels=model.late,
-        scaling=scaling,
-    )
-
-
-def leading_layers(model: Model) -> tuple[Wire, ...]:
-    """Dynamic layers that can take over a linear fit: they see as many channels as inputs."""
-    return tuple(
-        one
-        for one in model.wires
-        if isinstance(one.layer, Dynamic) and one.channels == model.inputs - model.direct
-    )
-
-
-def one_output(records: Sequence[PreparedRecord]) -> tuple[PreparedRecord, ...]:
-    """Records with their first output alone."""
-    names = [records[0].record.output_names[0]]
-    selected = [each.record.select(outputs=names) for each in records]
-    scaling = Scaling.from_records(selected)
-    return tuple(PreparedRecord.of(record, scaling) for record in selected)
 
 
 @dataclass(frozen=True)
@@ -195,14 +150,7 @@ def starting_point(model: Model, records: Sequence[PreparedRecord], plan: Plan) 
     else:
         errors = torch.cat([t - s[last] for t, s in zip(targets, signals, strict=True)])
         noise = (0.7 * torch.nanmean(errors.square(), 0).sqrt() + 1e-3).clamp_max(1.0)
-    for index, record in enumerate(records):
-        suffix = "" if len(records) == 1 else f"_{index}"
-        for one in model.state_sites:
-            assert isinstance(one.layer, Dynamic)
-            state = torch.zeros(len(one.layer.past_states), dtype=torch.float64)
-            if one.name == plan.leading and plan.linear is not None:
-                state = _linear_state(model, one, record, plan.linear)
-            values[f"{one.name}_initial_state{suffix}"] = state
+    values |= _first_states(model, records, plan)
     if model.likelihood.varying:
         values["log_noise_constant"] = (noise / TYPICAL).log()
     else:
@@ -211,6 +159,20 @@ def starting_point(model: Model, records: Sequence[PreparedRecord], plan: Plan) 
         if site.name not in values:
             values[site.name] = site.typical()
     return {name: value.detach().clone() for name, value in values.items()}
+
+
+def _first_states(model: Model, records: Sequence[PreparedRecord], plan: Plan) -> Values:
+    """Standard normal numbers of first states: of the leading layer those of the linear fit."""
+    values: Values = {}
+    for index, record in enumerate(records):
+        suffix = "" if len(records) == 1 else f"_{index}"
+        for one in model.state_sites:
+            assert isinstance(one.layer, Dynamic)
+            state = torch.zeros(len(one.layer.past_states), dtype=torch.float64)
+            if one.name == plan.leading and plan.linear is not None:
+                state = _linear_state(model, one, record, plan.linear)
+            values[f"{one.name}_initial_state{suffix}"] = state
+    return values
 
 
 def _beside(model: Model, one: Wire, leading: str | None) -> bool:
@@ -284,49 +246,3 @@ def starts_of(
     optima = {name: values for name, (_, _, values) in twins.items()}
     with seeded(seed):  # what has no typical value is drawn
         return [starting_point(model, records, one) for one in plans(model, optima, count, seed)]
-
-
-def linear_twins(
-    model: Model, records: Sequence[PreparedRecord], run: Run, steps: int
-) -> dict[str, Twin]:
-    """A fitted linear model for each layer that can take over one."""
-    scaling = records[0].scaling
-    twins: dict[str, Twin] = {}
-    known: dict[Model, Twin] = {}
-    for one in leading_layers(model):
-        assert isinstance(one.layer, Dynamic)
-        linear = linear_twin(model, one.layer, scaling)
-        if linear not in known:
-            training = tuple(records) if linear.outputs == model.outputs else one_output(records)
-            twin = replace(linear, scaling=training[0].scaling)
-            found = maximise(
-                twin,
-                training,
-                linear_starts(twin, training, None, run.seed),
-                run,
-                optimizer=optimizer_for(twin),
-                steps=min(LINEAR_STEPS, steps),
-                key=f"linear-{one.name}",
-            )
-            known[linear] = twin, training, [optimum.values for optimum in found]
-        twins[one.name] = known[linear]
-    return twins
-
-
-def linear_starts(
-    model: Model, records: Sequence[PreparedRecord], count: int | None, seed: int
-) -> list[Values]:
-    """Starts of a linear model: of subspace identification and with random poles, in turn.
-
-    Of a model with free dead times those of `delayed_starts`, as many in all.
-
-    Args:
-        model: the model. records: to which it is fitted. seed: of random poles.
-        count: how many; None for `RANDOM` of each kind, as far as there are orders.
-    """
-    if model.late:
-        return delayed_starts(model, records, count or 2 * RANDOM, seed)
-    subspace = subspace_starts(model, records, seed)[:RANDOM]
-    random = starting_values(model, records, count=count or RANDOM, seed=seed)
-    both = [one for pair in zip_longest(subspace, random) for one in pair if one is not None]
-    return both[:count]
