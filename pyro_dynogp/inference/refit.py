@@ -6,15 +6,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TypeVar
 
-import numpy as np
 import torch
 
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.importance import with_draws_around
-from pyro_dynogp.inference.methods.mode import at_optimum, climb, louder
+from pyro_dynogp.inference.methods.mode import at_optimum, climb, louder, most_probable
 from pyro_dynogp.inference.methods.nuts import sample_posterior
 from pyro_dynogp.inference.methods.optima import POLISH, Hyperparameters, posterior_of
 from pyro_dynogp.inference.methods.svi import Schedule
@@ -195,7 +193,7 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
 
     if target.is_linear:
         if run.steps:
-            return climbed(target, [_best(problem, starts)], run.steps)
+            return climbed(target, [most_probable(problem, starts)], run.steps)
         before, after = (one.dynamic[0][1] for one in (fit.model, target))
         more = after.pairs > before.pairs or after.integrators > before.integrators
         fresh = linear_starts(target, records, None, run.seed) if more else []
@@ -206,19 +204,12 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
         return climb(target, records, starts, [], run, steps=run.steps or ADDED_STEPS,
                      optimizer=optimizer_for(target), effort=EXTENDED)  # fmt: skip
     if run.steps:  # a few, to compare variants
-        starts = [_best(problem, starts)]
+        starts = [most_probable(problem, starts)]
     quiet = without_noise_below_functions(target)
     if quiet != target:
         best = climbed(quiet, [louder(start) for start in starts], LAYERED_STEPS)[0]
         starts = [*starts, grown(best.values, new)]
     return climbed(target, starts, LAYERED_STEPS)
-
-
-def _best(problem: Problem, starts: Sequence[Values]) -> Values:
-    """The most probable of several starts."""
-    potential = Potential(problem.target, (problem.records,), starts[0])
-    z = np.stack([potential.pack(start).numpy() for start in starts])
-    return starts[int(potential.values_and_gradients(z)[0].argmin())]
 
 
 def _posterior(

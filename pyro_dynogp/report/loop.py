@@ -16,7 +16,8 @@ from pyro_dynogp.effects import CATALOGUE, Effect
 from pyro_dynogp.fitting import fit as fit_model
 from pyro_dynogp.inference.fitted import known_fit
 from pyro_dynogp.inference.isolation import isolated
-from pyro_dynogp.inference.refit import WARMUP, family_of
+from pyro_dynogp.inference.refit import WARMUP, family_of, refit
+from pyro_dynogp.inference.run import Run
 from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.variants import used_channels
@@ -156,15 +157,19 @@ def _final(
     """Models of block A fitted to A and B, from what they have learnt.
 
     They have fresh starts, too, models with functions one, linear ones as many as in a first fit:
-    an optimum of less data may be a poor one of more, and errors before would be too large. Refits
+    an optimum of less data may be a poor one of more, and errors before would be too large. Models
+    with functions are refitted first, since in other units what is learnt may be far from any
+    optimum. Refits
     of the search are posterior modes; here the posterior is of the kind that the given fit has, and
     at least that of static functions is wanted.
     """
 
     def refitted(found: Fit) -> Fit:
         model = replace(found.model, scaling=None)
+        run = Run(found.seed, workers=1)
+        near = refit(found, record, model=model, run=run) if model.has_function else found
         return fit_model(
-            model, record, start=found, restarts=1 if model.has_function else None,
+            model, record, start=near, restarts=1 if model.has_function else None,
             seed=found.seed, workers=1, progress=False, **_method_of(given, model),
         )  # fmt: skip
 

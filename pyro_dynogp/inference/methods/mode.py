@@ -10,7 +10,7 @@ from typing import get_args
 
 import numpy as np
 
-from pyro_dynogp.inference.density import WALL
+from pyro_dynogp.inference.density import WALL, Potential
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.free_runs import free_run_error, noise_pays, silenced
 from pyro_dynogp.inference.methods.base import Problem
@@ -72,6 +72,13 @@ def louder(values: Values) -> Values:
         name: value.clamp_min(least[name]) if name in least else value
         for name, value in values.items()
     }
+
+
+def most_probable(problem: Problem, points: Sequence[Values]) -> Values:
+    """The most probable of several starts."""
+    potential = Potential(problem.target, (problem.records,), points[0])
+    z = np.stack([potential.pack(point).numpy() for point in points])
+    return points[int(potential.values_and_gradients(z)[0].argmin())]
 
 
 def _faint(values: Values) -> Values:
@@ -197,6 +204,8 @@ def cascade_optima(problem: Problem, run: Run, optimizer: Optimizer, steps: int)
         least = min([least, *(free_run_error(one, at[0], own) for one, own, at in lines)])
         starts = starts_of(model, records, twins, run.restarts or usual, again.seed)
         warm = [] if learnt is None else [grown(learnt, starts[0])]
+        if model.has_feedback:  # on other data its free runs may be far off
+            warm = [most_probable(problem, [one, louder(one)]) for one in warm]
         optima += climb(
             model, records, starts, warm, again, steps=steps, optimizer=optimizer,
             prefix=f"again-{attempt}-" if attempt else "", line=least,
