@@ -158,8 +158,7 @@ def _final(
 
     They have fresh starts, too, models with functions one, linear ones as many as in a first fit:
     an optimum of less data may be a poor one of more, and errors before would be too large. Models
-    with functions are refitted first, since in other units what is learnt may be far from any
-    optimum. Refits
+    with feedback are refitted first: free runs of what is learnt may be far off in other units. Refits
     of the search are posterior modes; here the posterior is of the kind that the given fit has, and
     at least that of static functions is wanted.
     """
@@ -167,7 +166,7 @@ def _final(
     def refitted(found: Fit) -> Fit:
         model = replace(found.model, scaling=None)
         run = Run(found.seed, workers=1)
-        near = refit(found, record, model=model, run=run) if model.has_function else found
+        near = refit(found, record, model=model, run=run) if model.has_feedback else found
         return fit_model(
             model, record, start=near, restarts=1 if model.has_function else None,
             seed=found.seed, workers=1, progress=False, **_method_of(given, model),

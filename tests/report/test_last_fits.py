@@ -8,11 +8,14 @@ import pyro_dynogp as dgp
 from pyro_dynogp.report import loop
 
 
-@pytest.mark.parametrize(("model", "fresh"), [(dgp.Wiener(1), 1), (dgp.LinearDynamicGP(1), None)])
+@pytest.mark.parametrize(
+    ("model", "fresh"),
+    [(dgp.Wiener(1), 1), (dgp.NonlinearFeedback(1), 1), (dgp.LinearDynamicGP(1), None)],
+)
 def test_last_fits_have_fresh_starts_too(monkeypatch, model, fresh):
     """From what is learnt alone functions can end where they fit noise, poles at poor optima.
 
-    What is learnt of a model with functions is first refitted in the units of all data.
+    What is learnt of a model with feedback is first refitted in the units of all data.
     """
     given, near = {}, SimpleNamespace()
 
@@ -30,4 +33,4 @@ def test_last_fits_have_fresh_starts_too(monkeypatch, model, fresh):
     user = SimpleNamespace(model=dgp.LinearDynamicGP(1), method="map", draws={"a": [0.0]})
     loop._final([found], user, "record", 1, False)
     assert given["restarts"] == fresh
-    assert given["start"] is (near if model.has_function else found)
+    assert given["start"] is (near if model.has_feedback else found)
