@@ -158,9 +158,9 @@ def _final(
 
     They have fresh starts, too, models with functions one, linear ones as many as in a first fit:
     an optimum of less data may be a poor one of more, and errors before would be too large. Models
-    with feedback are refitted first: free runs of what is learnt may be far off in other units. Refits
-    of the search are posterior modes; here the posterior is of the kind that the given fit has, and
-    at least that of static functions is wanted.
+    with feedback are refitted first: free runs of what is learnt may be far off in other units.
+    Refits of the search are posterior modes; here the posterior is of the kind that the given fit
+    has, and at least that of static functions is wanted.
     """
 
     def refitted(found: Fit) -> Fit:
