@@ -107,6 +107,7 @@ class HeteroscedasticNoise(Effect):
         if model.inputs == model.direct:
             return []
         of: Driver = "output" if evidence.where["driver"] == "mean" else "inputs"
-        if of == "output" and model.has_feedback:  # which such noise is not defined for
+        noise = Heteroscedastic(of=of)
+        if noise.follows_output and model.has_feedback:  # which such noise is not defined for
             return []
-        return [with_likelihood(model, Heteroscedastic(of=of))]
+        return [with_likelihood(model, noise)]

@@ -55,6 +55,11 @@ class Likelihood:
         """Whether the noise is Gaussian."""
         return self.degrees_of_freedom is None
 
+    @property
+    def follows_output(self) -> bool:
+        """Whether the size of the noise is a function of the model's output."""
+        return self.varying and self.of == "output"
+
     def sites(self, outputs: int, inputs: int, *, flat: bool = False) -> tuple[Site, ...]:
         """The sites of the noise of a model with so many outputs and inputs that drive it.
 

@@ -235,7 +235,7 @@ def _check_feedback(integrate: Integrate, likelihood: Likelihood) -> None:
             "sample by sample and cannot be sample sites",
             got=repr(integrate),
         )
-    if likelihood.varying and likelihood.of == "output":
+    if likelihood.follows_output:
         raise invalid(
             "likelihood",
             expected="noise of constant size, or one that varies with the inputs, for a model with "

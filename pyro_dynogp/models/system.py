@@ -196,7 +196,7 @@ class System:
             inputs: scaled. time: (n,) their times in the record's unit, or a `TimeGrid`.
         """
         likelihood = self.noise.likelihood
-        if likelihood.varying and likelihood.of == "output":
+        if likelihood.follows_output:
             return self.noise.sd(self.undisturbed(inputs, time))
         return self.noise.sd(self.driving(inputs))
 

@@ -136,9 +136,8 @@ def with_feedback(model: Model, *, output: bool = True, hidden: bool = False) ->
         model: to extend. output: whether one function sees the output of the layer.
         hidden: whether one sees a further signal of the same states, which nothing measures.
     """
-    varying = model.likelihood.varying and model.likelihood.of == "output"
-    heavy = model.likelihood.degrees_of_freedom is not None
-    if not model.dynamic or varying or heavy:
+    noise = model.likelihood
+    if not model.dynamic or noise.follows_output or not noise.gaussian:
         return None
     seen, layer = model.dynamic[-1]
     sources = {wire.name: wire.sources for wire in model.wires}
@@ -152,12 +151,11 @@ def with_feedback(model: Model, *, output: bool = True, hidden: bool = False) ->
     if not back or (model.has_feedback and not layer.feedback):
         return None
     names = (*layer.feedback, *(str(one.name) for one in back))
-    width = max(layer.hidden, int(hidden))
     layers: list[Layer] = []
     for wire, other in zip(model.wires, model.layers, strict=True):
         sees = () if wire.sources == (INPUTS,) and not layers else wire.sources
         if isinstance(other, Dynamic) and wire.name == seen.name:
-            other = replace(other, feedback=names, hidden=width)
+            other = replace(other, feedback=names, hidden=max(layer.hidden, int(hidden)))
         layers.append(replace(other, name=wire.name, sees=sees, skip=()))
         layers += back if wire.name == seen.name else []
     return replace(

@@ -1,8 +1,12 @@
 """Noise whose size depends on something."""
 
-import numpy as np
+from types import SimpleNamespace
 
-from pyro_dynogp.effects.heteroscedastic import heteroscedastic_noise
+import numpy as np
+import pytest
+
+import pyro_dynogp as dgp
+from pyro_dynogp.effects.heteroscedastic import HeteroscedasticNoise, heteroscedastic_noise
 from tests.discrepancy.made import SETTINGS
 from tests.discrepancy.series import residuals
 from tests.effects.scenes import growing_with_input, with_noise
@@ -24,3 +28,19 @@ class TestHeteroscedasticNoise:
     def test_heavy_tails_are_no_driver(self):
         series = (residuals(s, draw=lambda g, m: g.standard_t(4.0, m)) for s in range(5))
         assert np.median([heteroscedastic_noise(r, SETTINGS).p_value for r in series]) > 0.05
+
+
+@pytest.mark.parametrize(
+    ("model", "driver", "of"),
+    [
+        (dgp.LinearDynamicGP(1), "mean", ["output"]),
+        (dgp.NonlinearFeedback(1), "u", ["inputs"]),
+        (dgp.NonlinearFeedback(1), "mean", []),
+        (dgp.LinearDynamicGP(0), "mean", []),
+    ],
+    ids=["output", "input in feedback", "output in feedback", "no inputs"],
+)
+def test_noise_that_a_model_cannot_have_is_no_variant(model, driver, of):
+    """With feedback noise that follows the output is not defined; `close_loop` goes on without."""
+    found = HeteroscedasticNoise().extend(model, SimpleNamespace(where={"driver": driver}), None)
+    assert [variant.likelihood.of for variant in found] == of
