@@ -42,14 +42,15 @@ def parameters_of(fit: Fit, channels: Sequence[Channel], record: Record) -> Para
     """
     out: Parameters = {}
     present = [one for one in channels if one in fit.model.channels]
-    acting = [one for one in present if one.direct or not one.replaces]
-    if acting and fit.model.outputs == 1:
-        drawn = _drawn(fit)
+    single = fit.model.outputs == 1
+    acting = [one for one in present if single and (one.direct or not one.replaces)]
+    late = [(k, one) for k, one in enumerate(fit.model.late) if one in present]
+    drawn = _drawn(fit) if acting or late else {}
+    if acting:
         out |= _weights(fit, acting, drawn) | _gains(fit, acting, drawn)
-    for k, one in enumerate(fit.model.late):
-        if one in present:
-            label = _label(f"dead time of {one.channel}", record.time_unit)
-            out[label] = _moments(_drawn(fit)[DELAY][:, k].numpy())
+    for k, one in late:
+        label = _label(f"dead time of {one.channel}", record.time_unit)
+        out[label] = _moments(drawn[DELAY][:, k].numpy())
     for group in _together(present):
         out |= _numbers(fit, group, record)
     return out
@@ -117,9 +118,8 @@ def _together(channels: Sequence[Channel]) -> list[list[Channel]]:
 def _numbers(fit: Fit, group: Sequence[Channel], record: Record) -> Parameters:
     """Of the numbers that a channel, or a group with the same ones, is made with."""
     first = group[0]
-    if (
-        isinstance(first, Delayed) and first.delay is not None
-    ):  # all delays that are likely, on the same samples
+    if isinstance(first, Delayed) and first.delay is not None:
+        # All delays that are likely, on the same samples.
         reach = DELAYS * first.delay + STEPS * record.sampling_time
         record = where_inputs_are_known(record, min(reach, LOST * record.duration))
     whole = prepared(record, fit.model.channels)

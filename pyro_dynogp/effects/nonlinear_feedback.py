@@ -132,9 +132,9 @@ class NonlinearFeedbackOfOutput(Effect):
         fed = [wire for wire in model.wires if wire.feedback]
         if model.outputs > 1 or len(fed) != 1 or len(fed[0].feedback) != 1 or not fed[0].last:
             return {}
-        system, (name,) = fit.system_at(fit.draws), fed[0].feedback
         if len(fed[0].signals) > 1:  # what it sees is hidden
             return {}
+        system, (name,) = fit.system_at(fit.draws), fed[0].feedback
         dynamic, function = system.layer(fed[0].name), system.layer(name)
         assert isinstance(dynamic, DynamicSystem)
         assert not isinstance(function, DynamicSystem)

@@ -148,9 +148,10 @@ class Potential:
         self.model = pyro.poutine.condition(model, data=dict(fixed)) if fixed else model
         self.args, self.at = args, dict(values)
         self.log_density = density_of(model, args, fixed)
-        # Priors, and of a linear model all of it, without tensors, where there is such a form.
-        self.priors = vector_priors(getattr(self.log_density, "sites", []))
+        # All of a linear model, of others the priors, without tensors, where there is such a form.
         self.linear = linear_density(self.log_density)
+        sites = getattr(self.log_density, "sites", [])
+        self.priors = vector_priors(sites) if self.linear is None else None
         self.sites: list[Site] = []
         latent, count = self.log_density.latent(values)
         for name, prior, value in latent:
@@ -242,6 +243,10 @@ class Potential:
         values = torch.cat([value for value, _ in found]).numpy()
         values[np.isinf(values)] = WALL
         return values, torch.cat([gradient for _, gradient in found]).numpy()
+
+    def energies_at(self, points: Sequence[Mapping[str, Tensor]]) -> np.ndarray:
+        """Energies (k,) at values of the sites."""
+        return self.values_and_gradients(np.stack([self.pack(one).numpy() for one in points]))[0]
 
     def hessian(self, z: np.ndarray, *, step: float = 1e-4) -> np.ndarray:
         """Hessian (d, d) of the energy with Jacobian, by central differences of the gradient."""

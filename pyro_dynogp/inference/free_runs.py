@@ -87,7 +87,7 @@ def silenced(
     values = grown(optimum.values, dict(start))
     values = {k: SILENT * v if k in off else v for k, v in values.items()}
     potential = Potential(model, (records,), values)
-    (energy,), _ = potential.values_and_gradients(potential.pack(values).numpy()[None])
+    (energy,) = potential.energies_at([values])
     return replace(optimum, energy=float(energy), values=values)
 
 

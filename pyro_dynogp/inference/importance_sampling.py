@@ -283,8 +283,7 @@ def proposal_of(potential: Potential, optima: Sequence[Values], weights: Tensor)
 
 def distinct(potential: Potential, optima: Sequence[Values]) -> list[Values]:
     """Optima, each density once: what has the same one differs in the names of pairs."""
-    points = np.stack([potential.pack(values).numpy() for values in optima])
-    energies = potential.values_and_gradients(points)[0]
+    energies = potential.energies_at(optima)
     kept: list[int] = []
     for index in np.argsort(energies, kind="stable").tolist():
         if energies[index] < WALL and (not kept or energies[index] - energies[kept[-1]] > SAME):

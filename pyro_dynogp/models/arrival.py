@@ -84,7 +84,7 @@ def arriving(record: PreparedRecord, delays: Delays | None) -> tuple[Tensor, Ten
     """
     if delays is None:
         return record.inputs, record.scaled_inputs
-    time, inputs, first = record.around or (record.grid.time, record.inputs, 0)
+    time, inputs, first = record.surroundings
     own = slice(first, first + len(record))
     batch = delays.values.shape[:-1]
     columns = [u.expand((*batch, len(record))) for u in inputs[own].unbind(-1)]

@@ -23,10 +23,10 @@ from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.lti.delay import equivalent_inputs, moved_share
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.models.arrival import arriving
-from pyro_dynogp.models.prepared import PreparedRecord
+from pyro_dynogp.models.prepared import PreparedRecord, scaled_inputs
 from pyro_dynogp.models.system import DynamicSystem, System
 from pyro_dynogp.models.wiring import INPUTS, Wire
-from pyro_dynogp.support.tensors import as_tensor, joined
+from pyro_dynogp.support.tensors import joined
 
 # Steps that differ by less than this share of them are one.
 SAME = 1e-9
@@ -55,7 +55,7 @@ def arrive(system: System, record: PreparedRecord) -> Arrived:
     n_u = record.inputs.shape[-1] - (0 if system.direct is None else system.direct.shape[-1])
     late = [c for c in system.delays.columns if c < n_u]
     step, seeing = even_step(record), sum(INPUTS in w.sources for w in system.wires)
-    known = len(record) if record.around is None else len(record.around.time)
+    known = len(record.surroundings.time)
     if not late or not _takes_changes(system) or (step is None and (seeing > 1 or known < 2)):
         return Arrived(system, record.scaling, *arriving(record, system.delays))
     if step is None:
@@ -65,7 +65,7 @@ def arrive(system: System, record: PreparedRecord) -> Arrived:
 
 def even_step(record: PreparedRecord) -> float | None:
     """Step of the clock of a record and of what is known around it; None where steps differ."""
-    time = (record.grid.time if record.around is None else record.around.time).numpy()
+    time = record.surroundings.time.numpy()
     return sampling_time(time) if len(time) > 1 and is_regular(time) else None
 
 
@@ -83,14 +83,14 @@ def _takes_changes(system: System) -> bool:
     layers = {wire.name for wire, _ in system.dynamic}
     plain = all(w.name in layers and w.sources == (INPUTS,) and not w.fed for w in seeing)
     likelihood = system.noise.likelihood
-    return plain and not (likelihood.varying and likelihood.of != "output")
+    return plain and (not likelihood.varying or likelihood.follows_output)
 
 
 def _with_changes(
     system: System, record: PreparedRecord, late: list[int], n_u: int, step: float
 ) -> Arrived:
     assert system.delays is not None
-    _, inputs, first = record.around or (None, record.inputs, 0)
+    _, inputs, first = record.surroundings
     rows = first + torch.arange(len(record))
     # Where nothing has arrived by the end it does not matter how late it is.
     steps = (system.delays.values / step).clamp_max(float(len(inputs)))
@@ -114,7 +114,7 @@ def _with_changes(
 
 def _with_differences(system: System, record: PreparedRecord, late: list[int], n_u: int) -> Arrived:
     assert system.delays is not None
-    time, inputs, first = record.around or (record.grid.time, record.inputs, 0)
+    time, inputs, first = record.surroundings
     ((_, layer),) = [pair for pair in system.dynamic if pair[0].sources == (INPUTS,)]
     averaged = arriving(record, system.delays)[0]
     own = slice(first, first + len(record))
@@ -146,7 +146,6 @@ def _arrived(
 ) -> Arrived:
     """The system with more inputs, of the scales of some, and with given gains (*b, P, columns)."""
     scaling = _with_columns(record.scaling, more, n_u)
-    scaled = (inputs - as_tensor(scaling.input_offset)) / as_tensor(scaling.input_scale)
 
     def changed(wire: Wire, layer: DynamicSystem) -> DynamicSystem:
         if wire.sources != (INPUTS,):
@@ -158,7 +157,12 @@ def _arrived(
         modes = replace(modes, input_gain=B, feedthrough=D)
         return replace(layer, modes=modes, past=layer.past_inputs)
 
-    return Arrived(replace(system.with_layers(changed), delays=None), scaling, inputs, scaled)
+    return Arrived(
+        replace(system.with_layers(changed), delays=None),
+        scaling,
+        inputs,
+        scaled_inputs(inputs, scaling),
+    )
 
 
 def _with_columns(scaling: Scaling, late: list[int], n_u: int) -> Scaling:

@@ -59,6 +59,11 @@ class PreparedRecord:
         return len(self.record)
 
     @property
+    def surroundings(self) -> Surroundings:
+        """What is known around the record; the record itself where that is all."""
+        return self.around or Surroundings(self.grid.time, self.inputs, 0)
+
+    @property
     def begun(self) -> PreparedRecord:
         """From its first measured output on, with all inputs around it.
 
@@ -69,7 +74,7 @@ class PreparedRecord:
         first = int(measured.to(torch.int8).argmax())
         if not first:
             return self
-        time, inputs, before = self.around or (self.grid.time, self.inputs, 0)
+        time, inputs, before = self.surroundings
         return PreparedRecord(
             self.record[first:],
             self.scaling,

@@ -46,7 +46,7 @@ class Wire:
     @property
     def signals(self) -> dict[str, int]:
         """Names of the signals that the layer makes, and how many channels each has."""
-        return _signals(self.name, self.layer.outputs, _hidden(self.layer))
+        return _signals(self.name, self.layer)
 
     @property
     def feedback(self) -> tuple[str, ...]:
@@ -61,11 +61,10 @@ class Wire:
         the kind has with another length carry the layer's name.
         """
         own, first = f"{self.name}_input", self.sources == (INPUTS,)
-        hidden = _hidden(self.layer) > 0
         names = {
             "input": "input" if first and not self.fed else own,
             "direct": "input" if first else f"{self.name}_forward" if self.fed else own,
-            "output": "output" if self.last and not hidden else f"{self.name}_output",
+            "output": "output" if self.last and len(self.signals) == 1 else f"{self.name}_output",
         }
         for dim in ("pair", "brownian", "state", "inducing", "support"):
             names[dim] = dim if self.single else f"{self.name}_{dim}"
@@ -132,7 +131,7 @@ def wire(inputs: int, layers: Sequence[Layer], output: str | None = None) -> tup
         fed = sum(widths[source] for source in getattr(layer, "feedback", ()))
         single = sum(_letter(other) == _letter(layer) for other in layers) == 1
         wires.append(Wire(name, layer, sources, channels, False, last, single, fed))
-        width |= _signals(name, layer.outputs, _hidden(layer))
+        width |= _signals(name, layer)
         before = name
     _check_that_all_matter(wires, output)
     _check_hidden(wires)
@@ -146,9 +145,10 @@ def wire(inputs: int, layers: Sequence[Layer], output: str | None = None) -> tup
     return tuple(wires)
 
 
-def _signals(name: str, outputs: int, hidden: int) -> dict[str, int]:
+def _signals(name: str, layer: Layer) -> dict[str, int]:
     """Signals that a layer makes and their widths."""
-    return {name: outputs, name + HIDDEN: hidden} if hidden else {name: outputs}
+    hidden = _hidden(layer)
+    return {name: layer.outputs, name + HIDDEN: hidden} if hidden else {name: layer.outputs}
 
 
 def _names(layers: Sequence[Layer]) -> list[str]:

@@ -15,17 +15,24 @@ from tests.models.closed_loops import spring
 STEP = 0.05
 
 
-def duffing(n, seed, noise=0.02):
-    """x'' + 0.6 x' + 4 x + 4 x^3 = u, measured with noise; the true output."""
+def moved(n, seed, noise, acceleration, size, held, substeps):
+    """Force, position, and position measured with noise, of x'' = acceleration(u, x, x')."""
     rng = np.random.default_rng(seed)
-    u = np.repeat(5.0 * rng.standard_normal(n // 4 + 1), 4)[:n]
+    u = np.repeat(size * rng.standard_normal(n // held + 1), held)[:n]
     x, v, out = 0.0, 0.0, np.empty(n)
     for k in range(n):
         out[k] = x
-        for _ in range(20):
-            v += STEP / 20 * (u[k] - 0.6 * v - 4.0 * x - 4.0 * x**3)
-            x += STEP / 20 * v
-    y = out + noise * out.std() * rng.standard_normal(n)
+        for _ in range(substeps):
+            v += STEP / substeps * acceleration(u[k], x, v)
+            x += STEP / substeps * v
+    return u, out, out + noise * out.std() * rng.standard_normal(n)
+
+
+def duffing(n, seed, noise=0.02):
+    """x'' + 0.6 x' + 4 x + 4 x^3 = u, measured with noise; the true output."""
+    u, out, y = moved(
+        n, seed, noise, lambda u, x, v: u - 0.6 * v - 4.0 * x - 4.0 * x**3, 5.0, 4, 20
+    )
     y[[5, n // 2]] = np.nan
     return dgp.Record(time=STEP * np.arange(n), inputs=u, outputs=y), out, noise * out.std()
 
@@ -97,15 +104,9 @@ def test_every_verb(fitted, tmp_path):
 
 def rubbed(n, seed, noise=0.02):
     """x'' + 0.3 x' + 0.8 tanh(20 x') + 4 x = u; the position is measured, friction sees x'."""
-    rng = np.random.default_rng(seed)
-    u = np.repeat(3.0 * rng.standard_normal(n // 5 + 1), 5)[:n]
-    x, v, out = 0.0, 0.0, np.empty(n)
-    for k in range(n):
-        out[k] = x
-        for _ in range(40):
-            v += STEP / 40 * (u[k] - 0.3 * v - 0.8 * np.tanh(20.0 * v) - 4.0 * x)
-            x += STEP / 40 * v
-    y = out + noise * out.std() * rng.standard_normal(n)
+    u, out, y = moved(
+        n, seed, noise, lambda u, x, v: u - 0.3 * v - 0.8 * np.tanh(20.0 * v) - 4.0 * x, 3.0, 5, 40
+    )
     return dgp.Record(time=STEP * np.arange(n), inputs=u, outputs=y), out, noise * out.std()
 
 

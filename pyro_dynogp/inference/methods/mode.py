@@ -77,8 +77,7 @@ def louder(values: Values) -> Values:
 def most_probable(problem: Problem, points: Sequence[Values]) -> Values:
     """The most probable of several starts."""
     potential = Potential(problem.target, (problem.records,), points[0])
-    z = np.stack([potential.pack(point).numpy() for point in points])
-    return points[int(potential.values_and_gradients(z)[0].argmin())]
+    return points[int(potential.energies_at(points).argmin())]
 
 
 def _faint(values: Values) -> Values:

@@ -161,11 +161,10 @@ def warn_of_wide_draws(
         problem: model and records. mode: values of all sites. draws: (S, *shape) of all sites.
         free: names of the sites that are drawn.
     """
-    few = next(iter(draws.values()))[:CHECKED].shape[0]
-    points = [dict(mode), *({k: v[i] for k, v in draws.items()} for i in range(few))]
+    count = min(CHECKED, len(next(iter(draws.values()))))
+    points = [dict(mode), *({k: v[i] for k, v in draws.items()} for i in range(count))]
     potential = Potential(problem.target, (problem.records,), dict(mode))
-    z = np.stack([potential.pack(point).numpy() for point in points])
-    energies = potential.values_and_gradients(z)[0]
+    energies = potential.energies_at(points)
     loss, numbers = float(np.median(energies[1:]) - energies[0]), sum(mode[k].numel() for k in free)
     if loss > TOO_WIDE * numbers:
         warn(

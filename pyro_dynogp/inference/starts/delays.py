@@ -161,8 +161,7 @@ def delayed_starts(
             values[direct] = values[direct][..., prompt]
     every = [values for group in groups for values in group]
     potential = Potential(model.collapsed, (records,), every[0])
-    points = np.stack([potential.pack(values).numpy() for values in every])
-    energies = iter(potential.values_and_gradients(points)[0])
+    energies = iter(potential.energies_at(every))
     ranked = [sorted([(next(energies), i, v) for i, v in enumerate(group)], key=lambda one: one[:2])
               for group in groups]  # fmt: skip
     # The best of each dead time in turn: those that are likely, and then the densest.

@@ -108,9 +108,7 @@ class DynamicStart:
         That is a velocity where a position is measured. `ahead`: with the output itself added, the
         signal is that of a first-order lag before: a level in the tank above.
         """
-        decay, frequency = (
-            values[self._key(name)].exp() for name in ("log_decay", "log_frequency")
-        )
+        decay, frequency = (values[self._key(x)].exp() for x in ("log_decay", "log_frequency"))
         pole = torch.stack([-decay, frequency], -1)
         derivative = pole / pole.norm(dim=-1).median()
         return derivative + torch.tensor([float(ahead), 0.0], dtype=torch.float64)
