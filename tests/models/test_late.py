@@ -216,3 +216,26 @@ def test_numbers_of_a_delay():
             dgp.Delayed("u", **bad)
     assert dgp.Delayed("u").free
     assert not dgp.Delayed("u", 0.0).free
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        dgp.LinearDynamicGP, dgp.Wiener, dgp.Hammerstein, dgp.WienerHammerstein,
+        lambda inputs, **more: dgp.NonlinearFeedback(inputs, hidden=1, **more),
+    ],
+    ids=["linear", "Wiener", "Hammerstein", "Wiener-Hammerstein", "feedback"],
+)  # fmt: skip
+@pytest.mark.parametrize("at", [EVEN, UNEVEN], ids=["even", "uneven"])
+def test_the_dead_time_changes_the_likelihood(make, at):
+    record = record_at(at)
+    model, values, prepared = made(make(1, pairs=1, channels=(LATE,)), record, 3.3)
+
+    def likelihood(delay: float) -> float:
+        here = {**values, "delay": torch.tensor([delay], dtype=torch.float64)}
+        system = model.begin(model.system(here, model.scaling), model.states_of(here, ""))
+        return float(output_process(system, prepared).log_prob(prepared.observations))
+
+    before = likelihood(3.3)
+    for delay in (3.4, 3.8, 5.3):
+        assert abs(likelihood(delay) - before) > 1e-3
