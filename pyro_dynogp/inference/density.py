@@ -169,6 +169,12 @@ class Potential:
         """Length of the unconstrained vector."""
         return sum(site.unconstrained.numel() for site in self.sites)
 
+    def places(self, names: Sequence[str]) -> np.ndarray:
+        """Entries of the unconstrained vector that belong to some sites, in the vector's order."""
+        sizes = [site.unconstrained.numel() for site in self.sites]
+        owners = np.repeat([site.name for site in self.sites], sizes)
+        return np.flatnonzero(np.isin(owners, list(names)))
+
     @property
     def hessian_cost(self) -> int:
         """Evaluations, of `width` points each, that one-sided differences take for a Hessian."""

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import TypeVar
 
 import torch
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.function_evidence import kernel_sites, with_kernels_by_evidence
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.importance import with_draws_around
 from pyro_dynogp.inference.methods.mode import at_optimum, climb, louder, most_probable
@@ -40,7 +42,8 @@ from pyro_dynogp.support.parallel import seeded
 # Iterations from the old optima, and of Adam and SVI where they are of a model with functions.
 SAME_STEPS, ADAM_STEPS, SVI_STEPS = 300, 200, 400
 # Iterations of extended models: linear, others of the same layers, with a layer more.
-LINEAR_STEPS, LAYERED_STEPS, ADDED_STEPS = 100, 100, 300
+LINEAR_STEPS, LAYERED_STEPS = 100, 100
+ADDED_STEPS: Mapping[str, int] = MappingProxyType({"gauss-newton": 40, "lbfgs": 300, "adam": 300})
 # Starts from linear fits of its own that a model with a layer more has beside what is learnt, and
 # iterations of those fits.
 FRESH, FRESH_STEPS = 4, 40
@@ -157,21 +160,32 @@ def _again(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
 
     Better optimisers leave an optimum of a model with functions along its ridges.
     """
-    adam = fit.model.has_function and fit.method != "map"
+    feedback = fit.model.has_feedback
+    adam = fit.model.has_function and fit.method != "map" and not feedback
     steps = run.steps or (ADAM_STEPS if adam else SAME_STEPS)
     optimizer = "adam" if adam else optimizer_near(fit.model)
-    return maximise(
+    optima = maximise(
         problem.target, problem.records, optima_of(fit), run, optimizer=optimizer, steps=steps,
-        effort=AGAIN,
+        effort=AGAIN, held=kernel_sites(problem.target) if feedback else (),
     )  # fmt: skip
+    return _settled(problem, optima, run)
+
+
+def _settled(problem: Problem, optima: list[Optimum], run: Run) -> list[Optimum]:
+    """Optima with kernels by the evidence, with feedback and but for variants that are compared."""
+    if run.steps or not problem.target.has_feedback:
+        return optima
+    best = with_kernels_by_evidence(problem.target, problem.records, optima[0], run, "kernels")
+    return [best]
 
 
 def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     """Optima of a model that extends that of a fit.
 
-    With a layer more Adam climbs (L-BFGS with feedback), as in a first fit: better optimisers get
-    to modes of a free function that fit the noise (one that is flat where outputs repeat) and of
-    which its special cases have none, so that gains would be those of climbs. Where the function
+    With a layer more Adam climbs, as in a first fit: better optimisers get to modes of a free
+    function that fit the noise (one that is flat where outputs repeat) and of which its special
+    cases have none, so that gains would be those of climbs. With feedback they climb, and kernels
+    are then those of the highest evidence. Where the function
     is far from a line (a sensor that reports a size) the linear fit is any of several poor optima:
     such a model starts from linear fits of its own, too; a function in feedback from what is
     learnt, where nothing comes back as yet.
@@ -188,7 +202,7 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     def climbed(model: Model, points: Sequence[Values], usual: int) -> list[Optimum]:
         return maximise(
             model, records, points, run, optimizer=optimizer_near(model), steps=run.steps or usual,
-            effort=EXTENDED,
+            effort=EXTENDED, held=kernel_sites(model) if model.has_feedback else (),
         )  # fmt: skip
 
     if target.is_linear:
@@ -201,15 +215,17 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     if len(target.layers) > len(fit.model.layers):
         if not (run.steps or (target.has_feedback and fit.model.is_linear)):
             starts += starting_points(target, records, run, count=FRESH, steps=FRESH_STEPS)
-        return climb(target, records, starts, [], run, steps=run.steps or ADDED_STEPS,
-                     optimizer=optimizer_for(target), effort=EXTENDED)  # fmt: skip
+        optimizer = optimizer_for(target)
+        optima = climb(target, records, starts, [], run, steps=run.steps or ADDED_STEPS[optimizer],
+                       optimizer=optimizer, effort=EXTENDED)  # fmt: skip
+        return _settled(problem, optima, run)
     if run.steps:  # a few, to compare variants
         starts = [most_probable(problem, starts)]
     quiet = without_noise_below_functions(target)
     if quiet != target:
         best = climbed(quiet, [louder(start) for start in starts], LAYERED_STEPS)[0]
         starts = [*starts, grown(best.values, new)]
-    return climbed(target, starts, LAYERED_STEPS)
+    return _settled(problem, climbed(target, starts, LAYERED_STEPS), run)
 
 
 def _posterior(

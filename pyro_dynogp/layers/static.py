@@ -108,6 +108,11 @@ class StaticPrior:
         """Of the kernel's parameters."""
         return KernelPrior(self.name, self.kernel, self.channels)
 
+    @property
+    def kernel_sites(self) -> tuple[str, ...]:
+        """Names of the sites of the kernel and its scale."""
+        return (*(site.name for site in self.kernel_prior.sites()), f"{self.name}_output_scale")
+
     def sites(self, dims: Mapping[str, str] = NO_NAMES) -> tuple[Site, ...]:
         """The sites, in the order in which they are sampled.
 

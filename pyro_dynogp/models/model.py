@@ -95,7 +95,7 @@ class Model(Structure):
             elif isinstance(w.layer, Known):
                 yield from known_sites(w.name, w.layer)
             else:
-                yield from self._static_prior(w, w.layer).sites(w.dims)
+                yield from self.static_prior(w, w.layer).sites(w.dims)
                 if self._has_residual(w):
                     zero = torch.zeros(w.layer.outputs, w.layer.support, dtype=torch.float64)
                     prior = dist.Normal(zero, zero + 1.0).to_event(2)
@@ -178,7 +178,7 @@ class Model(Structure):
             place, layer: which one. values: of its sites.
             scaling: of the training record, by default the model's; for a layer with limits.
         """
-        function = self._static_prior(place, layer).function(values)
+        function = self.static_prior(place, layer).function(values)
         if layer.limits is None:
             return function
         return replace(function, limits=scaled_limits(layer.limits, scaling or self.scaling))
@@ -211,7 +211,8 @@ class Model(Structure):
         )
 
     @staticmethod
-    def _static_prior(place: Wire, layer: Static) -> StaticPrior:
+    def static_prior(place: Wire, layer: Static) -> StaticPrior:
+        """Prior of the function of a static layer."""
         return StaticPrior(
             place.name,
             channels=place.channels,

@@ -13,6 +13,7 @@ import numpy as np
 from pyro_dynogp.inference.density import WALL, Potential
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.free_runs import free_run_error, noise_pays, silenced
+from pyro_dynogp.inference.function_evidence import with_kernels_by_evidence
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.optimise.gauss_newton import has_innovations
 from pyro_dynogp.inference.optimise.maximum import (
@@ -171,6 +172,8 @@ def best_optima(
             "fit: no start reached a point where the likelihood can be evaluated. Check the "
             "record for jumps of many orders of magnitude, or try fewer pairs."
         )
+    if model.has_feedback:
+        optima = [with_kernels_by_evidence(problem.target, records, optima[0], run, "kernels")]
     return optima
 
 

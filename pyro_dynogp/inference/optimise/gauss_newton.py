@@ -93,11 +93,13 @@ class Innovations:
 
     Args:
         potential: of a model for which `has_innovations` holds.
+        free: entries of the unconstrained vector that vary; None for all.
     """
 
-    def __init__(self, potential: Potential) -> None:
+    def __init__(self, potential: Potential, free: np.ndarray | None = None) -> None:
         assert isinstance(potential.log_density, Direct)
         self.potential, self.density = potential, potential.log_density
+        self.free = np.arange(potential.size) if free is None else free
         self._linear = potential.linear
         self._there = [~torch.isnan(y) for y in self.density.observations]
         model = self.density.model
@@ -114,8 +116,11 @@ class Innovations:
             return _finite(prior + _energies(innovated))
 
     def local(self, z: np.ndarray) -> Local | None:
-        """Energy, gradient and curvatures at z (d,), by one-sided differences; None at an edge."""
-        points = np.concatenate([z[None], z + STEP * np.eye(len(z))])
+        """Energy, gradient and curvatures at z (d,), by one-sided differences; None at an edge.
+
+        Of the entries that vary.
+        """
+        points = np.concatenate([z[None], z + STEP * np.eye(len(z))[self.free]])
         innovated = self._innovations(points)
         errors, variances, rest = innovated
         prior, gradients = self._prior(points)
@@ -125,6 +130,7 @@ class Innovations:
             slopes = (level[:, 1:] - level[:, :1]) / STEP
             first = level[:, 0]
             weights = np.stack([first[0], math.sqrt(0.5) * (1.0 - first[0] ** 2)])
+            gradients = gradients[:, self.free]
             gradient = gradients[0] + sum(J @ w for J, w in zip(slopes, weights, strict=True))
             gradient -= (rest[1:] - rest[0]).sum(1) / STEP
             energy = float(prior[0]) + float(_energies(innovated)[0])
@@ -136,13 +142,13 @@ class Innovations:
         return Local(energy, gradient, fisher, curvature, first, sd, slopes)
 
     def bends(self, here: Local, z: np.ndarray, moves: np.ndarray) -> np.ndarray:
-        """Second derivatives along moves (k, d) from z (d,), projected on the slopes: (k, d)."""
+        """Second derivatives along moves (k, d) from z (d,), projected on the slopes (k, free)."""
         errors, variances, _ = self._innovations(z + ALONG * moves)
         with np.errstate(all="ignore"):
             level = np.stack([errors / here.sd, np.log(variances) * math.sqrt(0.5)])
             change = (level - here.level[:, None]) / ALONG
         parts = [
-            (2.0 / ALONG) * ((c - moves @ J) @ J.T)
+            (2.0 / ALONG) * ((c - moves[:, self.free] @ J) @ J.T)
             for c, J in zip(change, here.slopes, strict=True)
         ]
         return np.nan_to_num(sum(parts), posinf=0.0, neginf=0.0)
@@ -207,13 +213,15 @@ def climb(
         here = innovations.local(z)
         if here is None:
             return z, history, "no derivative"
-        curvature, axes = np.linalg.eigh(here.fisher + here.prior)
+        curvature, own = np.linalg.eigh(here.fisher + here.prior)
         curvature = np.maximum(np.abs(curvature), LEAST)
-        slope = axes.T @ here.gradient
+        slope = own.T @ here.gradient
+        axes = np.zeros((len(z), len(own)))  # with nothing along what does not vary
+        axes[innovations.free] = own
         tried = damping * DAMPINGS
         inverse = 1.0 / (curvature + tried[:, None])  # of each damping, along the axes
         moves = _shortened(-(slope * inverse) @ axes.T)
-        bends = -0.5 * ((innovations.bends(here, z, moves) @ axes) * inverse) @ axes.T
+        bends = -0.5 * ((innovations.bends(here, z, moves) @ own) * inverse) @ axes.T
         length, bent = (np.linalg.norm(x, axis=1, keepdims=True) for x in (moves, bends))
         bends *= np.minimum(1.0, BENT * length / np.maximum(bent, 1e-300))
         moves = np.concatenate([moves, moves + bends])

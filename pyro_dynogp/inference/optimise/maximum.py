@@ -81,7 +81,10 @@ class Optimum:
 
 @dataclass(frozen=True)
 class _Task:
-    """Starts that climb together; `goes_on` says that they have climbed already."""
+    """Starts that climb together; `goes_on` says that they have climbed already.
+
+    Sites in `held` keep their values.
+    """
 
     model: Program
     records: Records
@@ -92,6 +95,7 @@ class _Task:
     key: str
     rate: float
     goes_on: bool
+    held: tuple[str, ...] = ()
 
 
 def _lbfgs(functions: Functions, z: np.ndarray, task: _Task, every: int) -> Climb:
@@ -167,8 +171,10 @@ def _climb(task: _Task) -> list[Optimum]:
 def _climbs(potential: Potential, task: _Task) -> tuple[list[Climb], np.ndarray]:
     """Climbs from every start, and the energies (k,) at their ends."""
     starts = [potential.pack(start).numpy() for start in task.starts]
+    held = potential.places(task.held)
     if task.optimizer == "gauss-newton":
-        innovations = gauss_newton.Innovations(potential)
+        free = np.setdiff1d(np.arange(potential.size), held)
+        innovations = gauss_newton.Innovations(potential, free)
         found = [gauss_newton.climb(innovations, z, task.steps) for z in starts]
         return found, innovations.energies(np.stack([z for z, _, _ in found]))
     method = _METHODS[task.optimizer]
@@ -177,7 +183,12 @@ def _climbs(potential: Potential, task: _Task) -> tuple[list[Climb], np.ndarray]
     def run(z: np.ndarray) -> Callable[[Functions], Climb]:
         return lambda functions: method(functions, z, task, every)
 
-    found = in_lockstep(potential.values_and_gradients, [run(z) for z in starts])
+    def functions(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        values, gradients = potential.values_and_gradients(z)
+        gradients[:, held] = 0.0  # no optimizer moves along them
+        return values, gradients
+
+    found = in_lockstep(functions, [run(z) for z in starts])
     return found, potential.values_and_gradients(np.stack([z for z, _, _ in found]))[0]
 
 
@@ -230,13 +241,14 @@ def maximise(
     steps: int = 500,
     key: str = "optimum",
     effort: Effort = EFFORT,
+    held: Sequence[str] = (),
 ) -> list[Optimum]:
     """Climb from every start; the optima sorted by energy, best first.
 
     All starts get a fifth of the steps, then the best of them the rest (successive halving: a start
     that is far behind by then hardly ever wins); by Gauss-Newton in the stages of `RANKED`. The
     mode is that of the density of the constrained values (no Jacobian), as AutoDelta has it. The
-    result does not depend on the number of processors.
+    result does not depend on the number of processors. Sites in `held` keep their values.
     """
     # Gauss-Newton evaluates several points by itself.
     together = 1 if optimizer == "gauss-newton" else effort.together
@@ -253,6 +265,7 @@ def maximise(
                 f"{key}-{label}-{i}",
                 effort.rate,
                 effort.near or label.startswith("optima"),
+                tuple(held),
             )
             for i, batch in enumerate(_batches(values, model, records, together))
         ]
@@ -300,12 +313,13 @@ def _stages(
 
 
 def optimizer_for(model: Model) -> Optimizer:
-    """Gauss-Newton for linear models under Gaussian noise, Adam for functions, else L-BFGS.
+    """Gauss-Newton under Gaussian noise for linear models and with feedback, Adam for functions.
 
-    Of models with functions Gauss-Newton finds higher modes, but with output scales and short
-    lengthscales that make the functions less certain than they are.
+    Else L-BFGS. Of other models with functions Gauss-Newton finds higher modes, but with output
+    scales and short lengthscales that make the functions less certain than they are. With feedback
+    kernels are found by the evidence afterwards, and L-BFGS stops far below the top.
     """
-    if model.is_linear and has_innovations(model):
+    if has_innovations(model) and (model.is_linear or model.has_feedback):
         return "gauss-newton"
     return "adam" if model.has_function and not model.has_feedback else "lbfgs"
 

@@ -1,0 +1,202 @@
+r"""Kernels of static functions by the evidence: their values are integrated out.
+
+The highest joint density of a function's values and of its kernel is a poor guide to the kernel:
+whitened values near zero under a large output scale and a short lengthscale are more probable than
+the same function under a kernel that fits it, because the joint density does not count how few of
+the functions of that kernel look like it. Bands are then far too wide, and free runs with the
+function in feedback run away. So output scale and kernel parameters, theta, are those of the
+highest evidence, all else is the mode given them (type-II maximum a posteriori, empirical Bayes).
+
+Near the mode the log likelihood is quadratic in the whitened values v, with gradient g and Fisher
+matrix F at v0. Under another kernel the same function has values v' with v = A v', where
+A = (s L)^-1 s' L' and L is the Cholesky factor of the kernel's matrix at the inducing locations.
+With P = I + A' F A and m = P^-1 A' (g + F v0) (Rasmussen & Williams 2006, sections 3.4 and 5.2)
+
+    log p(y | theta') = const + g' o - o' F o / 2 - m' m / 2 - log |P| / 2,    o = A m - v0.
+
+Its maximum, and a climb of all other sites with theta held, take turns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from torch import Tensor
+
+from pyro_dynogp.data.scaling import Scaling
+from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.optimise.gauss_newton import Innovations, has_innovations
+from pyro_dynogp.inference.optimise.maximum import Effort, Optimum, maximise, optimizer_near
+from pyro_dynogp.inference.run import Run
+from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.prepared import PreparedRecord
+from pyro_dynogp.models.wiring import Static, Wire
+
+# Rounds, iterations of the climb in each, and the gain [nats] with which rounds end.
+ROUNDS, STEPS, SETTLED = 4, 15, 0.1
+# Farthest that a parameter goes in one round, in unconstrained units.
+FARTHEST = 1.5
+SEARCH_STEPS = 60
+
+
+def functions_of(model: Model) -> list[tuple[Wire, Static]]:
+    """Static layers with a function that is learnt."""
+    return [(wire, wire.layer) for wire in model.wires if isinstance(wire.layer, Static)]
+
+
+def kernel_sites(model: Model) -> tuple[str, ...]:
+    """Names of the sites of all kernels and output scales."""
+    each = (model.static_prior(wire, layer).kernel_sites for wire, layer in functions_of(model))
+    return tuple(name for names in each for name in names)
+
+
+def with_kernels_by_evidence(
+    model: Model,
+    records: tuple[PreparedRecord, ...],
+    optimum: Optimum,
+    run: Run,
+    key: str,
+    rounds: int = ROUNDS,
+) -> Optimum:
+    """An optimum with kernels of the highest evidence, and all else at its mode given them.
+
+    Args:
+        model: collapsed. records: of it. optimum: to begin at.
+        run: how. key: of checkpoints. rounds: most of them.
+
+    Returns:
+        The optimum, or the given one where no round raises the evidence.
+    """
+    names = kernel_sites(model)
+    if not names:
+        return optimum
+    optimizer = "gauss-newton" if has_innovations(model) else optimizer_near(model)
+    here = _Expansion.at(model, records, optimum.values)
+    for number in range(rounds):
+        values, gain = here.best()
+        if gain < SETTLED:
+            break
+        found = maximise(
+            model, records, [values], run, optimizer=optimizer, steps=STEPS,
+            key=f"{key}-{number}", effort=Effort(near=True), held=names,
+        )[0]  # fmt: skip
+        there = _Expansion.at(model, records, found.values)
+        if not there.energy < here.energy:
+            break
+        here = there
+        history = np.concatenate([optimum.history, found.history])
+        optimum = replace(found, history=history, message=optimum.message)
+    return optimum
+
+
+@dataclass(frozen=True, eq=False)
+class _Expansion:
+    """The log likelihood near a point, as a function of all whitened values.
+
+    Attributes:
+        model: collapsed. scaling: of the records. potential: of the model. z: (d,), the point.
+        places: (m,), entries of the whitened values. gradient: (m,) and fisher: (m, m), of the log
+            likelihood by them.
+        joint: energy of the point.
+    """
+
+    model: Model
+    scaling: Scaling
+    potential: Potential
+    z: np.ndarray
+    places: np.ndarray
+    gradient: Tensor
+    fisher: Tensor
+    joint: float
+
+    @classmethod
+    def at(
+        cls, model: Model, records: tuple[PreparedRecord, ...], values: dict[str, Tensor]
+    ) -> _Expansion:
+        """By differences over one-step predictions, where the model has such, else of gradients."""
+        potential = Potential(model, (records,), values)
+        z = potential.pack(values).numpy()
+        places = potential.places([f"{wire.name}_values" for wire, _ in functions_of(model)])
+        local = Innovations(potential, places).local(z) if has_innovations(model) else None
+        if local is not None:
+            energy, slope, fisher = local.energy, local.gradient, local.fisher
+        else:
+            energy, slopes = potential.value_and_gradient(z)
+            slope = slopes[places]
+            curvature = potential.hessian_of(z, places.tolist()) - np.eye(len(places))
+            eigenvalues, axes = np.linalg.eigh(curvature)
+            fisher = (axes * eigenvalues.clip(0.0)) @ axes.T
+        gradient = z[places] - slope  # the prior of whitened values is standard normal
+        return cls(
+            model,
+            records[0].scaling,
+            potential,
+            z,
+            places,
+            torch.tensor(gradient),
+            torch.tensor(fisher),
+            energy,
+        )
+
+    @property
+    def energy(self) -> float:
+        """-log density of the kernels and of all else but the functions' values [nats]."""
+        inner = torch.eye(len(self.places), dtype=torch.float64) + self.fisher
+        return self.joint + 0.5 * float(torch.linalg.slogdet(inner).logabsdet)
+
+    def _roots(self, values: dict[str, Tensor]) -> Iterator[Tensor]:
+        """Scaled roots s L of each function and output."""
+        for wire, layer in functions_of(self.model):
+            function = self.model.static_function(wire, layer, values, self.scaling)
+            yield from (scale * function.root for scale in function.output_scale)
+
+    def best(self) -> tuple[dict[str, Tensor], float]:
+        """Values of all sites with the kernels of the highest evidence, and what that gains."""
+        names = kernel_sites(self.model)
+        kernels = self.potential.places(names)
+        index, whole = torch.tensor(kernels), torch.tensor(self.z)
+        with torch.no_grad():
+            old = list(self._roots(self.potential.unpack(whole)))
+        v0 = whole[torch.tensor(self.places)]
+        identity = torch.eye(len(v0), dtype=torch.float64)
+        pull = self.gradient + self.fisher @ v0
+        prior = {s.name: s.prior for s in self.model.sites(self.scaling) if s.name in names}
+
+        def level(theta: Tensor) -> tuple[Tensor, Tensor]:
+            """Log evidence and prior of kernels, and the whitened values that go with them."""
+            values = self.potential.unpack(whole.index_put((index,), theta))
+            roots = zip(old, self._roots(values), strict=True)
+            A = torch.block_diag(
+                *(torch.linalg.solve_triangular(a, b, upper=False) for a, b in roots)
+            )
+            root = torch.linalg.cholesky(identity + A.mT @ self.fisher @ A)
+            m = torch.cholesky_solve((A.mT @ pull)[:, None], root)[:, 0]
+            off = A @ m - v0
+            found = self.gradient @ off - 0.5 * (off @ self.fisher @ off + m @ m)
+            found = found - root.diagonal().log().sum()
+            return found + sum(
+                prior[n].log_prob(values[n]).sum() for n in kernel_sites(self.model)
+            ), m
+
+        def objective(theta: np.ndarray) -> tuple[float, np.ndarray]:
+            x = torch.tensor(theta, requires_grad=True)
+            with torch.enable_grad():
+                value = -level(x)[0]
+                (slope,) = torch.autograd.grad(value, x)
+            return float(value), slope.numpy()
+
+        begin = self.z[kernels]
+        bounds = [(x - FARTHEST, x + FARTHEST) for x in begin]
+        found = minimize(
+            objective, begin, jac=True, method="L-BFGS-B", bounds=bounds,
+            options={"maxiter": SEARCH_STEPS},
+        )  # fmt: skip
+        with torch.no_grad():
+            before, after = level(torch.tensor(begin))[0], level(torch.tensor(found.x))
+        z = self.z.copy()
+        z[kernels], z[self.places] = found.x, after[1].numpy()
+        return self.potential.unpack(torch.tensor(z)), float(after[0] - before)
