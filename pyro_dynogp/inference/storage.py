@@ -32,8 +32,8 @@ from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 
 FORMAT = "pyro_dynogp.fit"
-# Version 6 is written; 4 and 5 are read, too, which have no digest.
-VERSION, OLDEST, UNMARKED = 6, 4, 5
+# Version 7 is written; 4 to 6 are read, too, of which 4 and 5 have no digest.
+VERSION, OLDEST, UNMARKED = 7, 4, 5
 # The models that a file may name: a file never decides what code is run.
 MODELS = ("Model", "Cascade", "LinearDynamicGP")
 # Arrays of draws with densities, where there are such.
