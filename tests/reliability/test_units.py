@@ -279,7 +279,7 @@ class TestGauge:
         assert other == pytest.approx(one, abs=1e-8)
 
     def test_lengths_have_their_most_likely_one_where_climbs_stay(self, problem, start):
-        """A length r of 2 n_y standard normal numbers has the density r^(2 n_y - 1) exp(-r^2 / 2)."""
+        """2 n_y normal numbers have a length r with the density r^(2 n_y - 1) exp(-r^2 / 2)."""
         potential = Potential(problem.target, (problem.records,), start)
         lengths = Lengths(potential.sites)
         z = potential.pack(start).numpy()
