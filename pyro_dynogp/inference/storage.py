@@ -303,15 +303,15 @@ def _labels(record: Record) -> dict[str, Any]:
     return labels
 
 
-def _record(labels: Mapping[str, Any], tensors: Mapping[str, Tensor], key: str) -> Record:
-    """Inverse of `_arrays` and `_labels`."""
+def _record(labels: Mapping[str, Any], tensors: dict[str, Tensor], key: str) -> Record:
+    """Inverse of `_arrays` and `_labels`; what it copies is taken from the tensors."""
     given = dict(labels)
     if "start" in given:
         instant, zone = given["start"]
         given["start"] = pd.Timestamp(instant).tz_convert(zone)
-    extra = {name: tensors[f"{key}/extra/{name}"].numpy() for name in given["extra_units"]}
+    extra = {name: tensors.pop(f"{key}/extra/{name}").numpy() for name in given["extra_units"]}
     time, inputs, outputs = (
-        tensors[f"{key}/{name}"].numpy() for name in ("time", "inputs", "outputs")
+        tensors.pop(f"{key}/{name}").numpy() for name in ("time", "inputs", "outputs")
     )
     return Record(time, inputs, outputs, extra=extra, **given)
 
