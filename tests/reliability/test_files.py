@@ -37,6 +37,7 @@ def fits(world):
     few = {"steps": 2, "draws": 5, **QUICK}
     two = short.with_outputs(np.column_stack([short.outputs, short.outputs**2]), names=["y", "z"])
     nuts = dgp.Nuts(chains=1, warmup=2, draws=4)
+    delayed = (dgp.Delayed("valve"), Trend(0.0, 2.0))
     stamped = dataclasses.replace(short, start="2024-01-01T00:00:00+01:00", extra={"a": short.time})
     return {
         "map": world.fit,
@@ -55,8 +56,7 @@ def fits(world):
             dgp.LinearDynamicGP(1, pairs=1, likelihood=dgp.Heteroscedastic()), short, **MODE
         ),
         "channels": dgp.fit(
-            dgp.LinearDynamicGP(2, pairs=1, direct=1, channels=(dgp.Delayed("valve"), Trend(0.0, 2.0))),
-            stamped, **MODE,
+            dgp.LinearDynamicGP(2, pairs=1, direct=1, channels=delayed), stamped, **MODE
         ),
         "Hammerstein": dgp.fit(dgp.Hammerstein(1, pairs=1, inducing=4), short, **MODE),
         "Wiener-Hammerstein": dgp.fit(
