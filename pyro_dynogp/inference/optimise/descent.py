@@ -29,8 +29,8 @@ FOLLOWED = 3.0
 # Change of the unconstrained vector over which a gradient's change is its derivative.
 STEP = 1e-4
 # Of `polished`: least curvature of a direction that is followed, longest step and most of them,
-# and a step at which rounding is all that is left.
-CURVED, LONGEST, POLISHING, DONE = 1e-5, 1.0, 60, 1e-9
+# and a step after which rounding is all that is left.
+CURVED, LONGEST, POLISHING, DONE = 1e-5, 1.0, 60, 1e-6
 
 
 def hessian(

@@ -167,9 +167,11 @@ def _to_the_top(functions: Functions, climb: Climb, every: int) -> Climb:
     slow = len(lately) > gauss_newton.PATIENCE and lately[0] - lately[-1] < NEAR
     if message != gauss_newton.DONE and not slow:
         return climb
-    z, further, _ = descend(functions, z, RIDGE, every=every, first=0)
+    if message != gauss_newton.DONE:
+        z, further, _ = descend(functions, z, RIDGE, every=every, first=0)
+        history = [*history, *further]
     z, energy = polished(functions, z)
-    return z, [*history, *further, energy], message
+    return z, [*history, energy], message
 
 
 def _placed(potential: Potential, z: np.ndarray) -> np.ndarray:
