@@ -55,14 +55,16 @@ def kills(count, whole, generator):
 
     Those that are done before they can be killed do not count.
     """
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, started(folder) as process:
+        _until_it_works(folder, process)
         begin = time.perf_counter()
-        started(folder).wait()
+        process.communicate()
         seconds = time.perf_counter() - begin
     found = Counter()
     while sum(found.values()) < count:
         with tempfile.TemporaryDirectory() as folder, started(folder) as process:
-            time.sleep(generator.uniform(0.1, 1.0) * seconds)
+            _until_it_works(folder, process)
+            time.sleep(generator.uniform() * seconds)
             process.send_signal(signal.SIGKILL)
             process.communicate()
             if process.returncode != -signal.SIGKILL:
@@ -72,6 +74,12 @@ def kills(count, whole, generator):
             left = len(list(Path(folder).glob("*.part")))
             found[f"{'some' if pieces else 'no'} pieces: {verdict}, {left} parts left"] += 1
     return found
+
+
+def _until_it_works(folder, process):
+    """Wait for the note that a fit writes before any work: imports take longer than the rest."""
+    while not (Path(folder) / "run.json").exists() and process.poll() is None:
+        time.sleep(0.005)
 
 
 def pairs(count, whole):
