@@ -18,7 +18,7 @@ LINES = 31_500
 # signals (180 lines), dead times with a posterior (1230 lines), simulated plants with feedback
 # (320 lines), the same fit in any unit and order (310 lines) and large files (90 lines) came since.
 # To shrink, and to go.
-LINES_TODAY = 46_100
+LINES_TODAY = 46_110
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()
