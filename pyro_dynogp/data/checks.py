@@ -29,7 +29,7 @@ def frozen(array: Array) -> Array:
 
 
 def real_numbers(argument: str, value: Any) -> Array:
-    """Real numbers as float64; what is no number is refused, never parsed."""
+    """Real numbers as float64, not copied where they are; what is no number is refused."""
     if isinstance(value, Tensor):
         value = value.detach().cpu()
         value = (value if value.is_complex() else value.to(torch.float64)).numpy()
@@ -54,7 +54,7 @@ def real_numbers(argument: str, value: Any) -> Array:
             argument, expected=expected, got=f"an array of type {array.dtype}",
             advice="Convert it first; text columns are read by Record.from_csv.",
         )  # fmt: skip
-    return array.astype(np.float64)
+    return array.astype(np.float64, copy=False)
 
 
 def as_channels(argument: str, value: Any, n: int, columns: int | None = None) -> Array:

@@ -13,7 +13,7 @@ import numpy as np
 from pyro_dynogp.data.checks import Array
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.records import as_records
-from pyro_dynogp.support.errors import invalid, verify_fields
+from pyro_dynogp.support.errors import invalid, verify_fields, whole
 
 _ARRAYS = ("input_offset", "input_scale", "output_offset", "output_scale")
 _NAMES = ("input_names", "output_names", "input_units", "output_units")
@@ -37,6 +37,8 @@ class Scaling:
         input_units: units of the inputs.
         output_units: units of the outputs.
         time_unit: unit of time.
+        reference_output: place of the smoothest output, by which the phases of modes are told: the
+            same one in whatever order and units the outputs are given.
     """
 
     time_step: float
@@ -50,12 +52,15 @@ class Scaling:
     input_units: tuple[str, ...]
     output_units: tuple[str, ...]
     time_unit: str
+    reference_output: int = 0
 
     def __post_init__(self) -> None:
         for field in _ARRAYS:
             array = np.array(getattr(self, field), dtype=np.float64)
             array.setflags(write=False)
             object.__setattr__(self, field, array)
+        outputs = len(self.output_scale)
+        whole(0, max(outputs - 1, 0)).check("reference_output", self.reference_output)
 
     @classmethod
     def from_records(cls, records: Record | Sequence[Record]) -> Scaling:
@@ -92,6 +97,7 @@ class Scaling:
             output_offset=y_offset,
             output_scale=y_scale,
             time_unit=first.time_unit,
+            reference_output=_smoothest([(r.outputs - y_offset) / y_scale for r in several]),
             **{field: getattr(first, field) for field in _NAMES},
         )
 
@@ -147,13 +153,13 @@ class Scaling:
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> Scaling:
-        """Scaling from what `to_dict` gave.
+        """Scaling from what `to_dict` gave; before format 7 the first output was the reference.
 
         Raises:
             ValueError: missing or unknown entries, or text that is no hexadecimal number.
         """
         fields = {field.name for field in dataclasses.fields(cls)}
-        if set(plain) != fields:
+        if not fields - {"reference_output"} <= set(plain) <= fields:
             raise invalid("plain", expected=f"entries {sorted(fields)}", got=f"{sorted(plain)}")
         values = dict(plain)
         try:
@@ -217,6 +223,14 @@ class TimeScale:
     def typical_rate(self) -> float:
         """Geometric mean [1/s] of the slowest and fastest rates."""
         return math.exp(0.5 * sum(self.rate_bounds))
+
+
+def _smoothest(outputs: Sequence[Array]) -> int:
+    """Place of the scaled output that changes least from one sample to the next."""
+    changes = np.concatenate([np.diff(y, axis=0) for y in outputs])
+    there = ~np.isnan(changes)
+    total = np.square(np.where(there, changes, 0.0)).sum(0)
+    return int(np.argmin(np.where(there.any(0), total / np.maximum(there.sum(0), 1), np.inf)))
 
 
 def _statistics(role: str, arrays: list[Array], names: tuple[str, ...]) -> tuple[Array, Array]:

@@ -18,6 +18,7 @@ import numpy as np
 import pandas as pd
 
 from pyro_dynogp.data.checks import Array
+from pyro_dynogp.data.plain_numbers import plain_numbers, whole_file
 from pyro_dynogp.support.errors import invalid
 
 LONGEST_LINE = 2**20  # characters: what is longer is no table
@@ -31,16 +32,19 @@ _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 
 @dataclasses.dataclass(frozen=True)
 class TextTable:
-    """Cells of a text file by column, with the line each row came from."""
+    """Cells of a text file by column, or its numbers, with the line each row came from."""
 
-    columns: dict[str, tuple[str, ...]]
-    lines: tuple[int, ...]
+    columns: dict[str, tuple[str, ...]] | dict[str, Array]
+    lines: Sequence[int]
     decimal: str
 
     def numbers(self, column: str) -> Array:
         """The numbers (n,) of a column."""
+        cells = self.columns[column]
+        if isinstance(cells, np.ndarray):
+            return cells
         values = np.empty(len(self.lines))
-        for row, cell in enumerate(self.columns[column]):
+        for row, cell in enumerate(cells):
             number = _number(cell, self.decimal)
             if number is None:
                 raise no_number(f"line {self.lines[row]}", column, cell)
@@ -50,7 +54,9 @@ class TextTable:
     def times(self, column: str, timezone: str | None) -> Array | pd.DatetimeIndex:
         """The times of a column: numbers, or time stamps."""
         cells = named_column(self.columns, "time", column)
-        if all(_number(cell, self.decimal) is not None for cell in cells):
+        if isinstance(cells, np.ndarray) or all(
+            _number(cell, self.decimal) is not None for cell in cells
+        ):
             return self.numbers(column)
         matches = [_STAMP.fullmatch(cell) for cell in cells]
         naive = matches[0] is not None and matches[0]["zone"] is None
@@ -77,13 +83,16 @@ def read_table(
     delimiter: str | None, decimal: str | None, encoding: str,
 ) -> TextTable:  # fmt: skip
     """A table of a text file: columns by name."""
-    numbered = list(_lines(path, encoding))
-    if not numbered:
-        raise invalid("path", expected="a file with a line of data", got=f"{path}, which has none")
     if delimiter is not None and len(delimiter) != 1:
         raise invalid("delimiter", expected="one character", got=repr(delimiter))
     if decimal not in (None, ".", ","):
         raise invalid("decimal", expected='"." or ","', got=repr(decimal))
+    plain = _plain_table(path, header, names, delimiter, decimal)
+    if plain is not None:
+        return plain
+    numbered = list(_lines(path, encoding))
+    if not numbered:
+        raise invalid("path", expected="a file with a line of data", got=f"{path}, which has none")
     mark = delimiter or _sniff([text for _, text in numbered[:50]])
     if mark.isspace() and mark != "\t":
         numbered = [(i, " ".join(text.split())) for i, text in numbered]
@@ -128,6 +137,34 @@ def read_table(
             advice="Give names=[...] for all columns, and header=True to skip those of the file.",
         )  # fmt: skip
     return TextTable(columns, tuple(lines), decimal)
+
+
+def _plain_table(
+    path: Path, header: bool | None, names: Sequence[str] | None,
+    delimiter: str | None, decimal: str | None,
+) -> TextTable | None:  # fmt: skip
+    """The table of a large file of plain numbers; None where anything is out of the ordinary."""
+    data = None if decimal == "," or path.suffix in _OPENERS else whole_file(path)
+    if data is None:
+        return None
+    texts = [text for text in data[:100_000].decode("ascii").splitlines() if text.strip()][:50]
+    mark = delimiter or (_sniff(texts) if texts else " ")
+    rows = [[cell.strip() for cell in text.split(mark)] for text in texts]
+    if mark == " " or (not mark.isprintable() and mark != "\t") or len(rows) < 50:
+        return None
+    if mark != "," and any(_DECIMAL_COMMA.fullmatch(cell) for row in rows for cell in row):
+        return None
+    if header is None:
+        header = names is None and not all(_is_data(cell, ".") for cell in rows[0])
+    width = len(rows[1])
+    given = list(names) if names is not None else rows[0] if header else [""] * width
+    labels = _block_names(given) if header or names is not None else [str(i) for i in range(width)]
+    if len(given) != width or len(set(labels)) != width:
+        return None
+    values = plain_numbers(data, mark, width, header)
+    if values is None:
+        return None
+    return TextTable(dict(zip(labels, values.T, strict=True)), range(len(values)), ".")
 
 
 def _lines(path: Path, encoding: str) -> Iterator[tuple[int, str]]:

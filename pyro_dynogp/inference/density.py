@@ -16,7 +16,7 @@ from torch.distributions.transforms import Transform
 
 from pyro_dynogp.inference.linear_density import LinearEnergy, linear_density
 from pyro_dynogp.inference.log_joint import Direct, LogJoint, density_of
-from pyro_dynogp.inference.optimise.descent import WIDEST, bounded_root, descend, hessian
+from pyro_dynogp.inference.optimise.descent import WIDEST, bounded_root, descend, hessian, polished
 from pyro_dynogp.inference.priors_of_vectors import Constrained, vector_priors
 from pyro_dynogp.layers.sites import Arguments, Program
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
@@ -291,6 +291,7 @@ class Potential:
         z, _, _ = descend(
             self.with_jacobian, self.pack(values).numpy(), steps, every=every, first=0
         )
+        z, _ = polished(self.with_jacobian, z)
         return z, bounded_root(self.hessian(z))
 
 

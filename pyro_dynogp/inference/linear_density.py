@@ -113,8 +113,9 @@ class LinearDensity:
         late = columns_of(model.late, scaling)
         prompt = tuple(column for column in range(driving) if column not in late)
         self._systems = LinearSystems(
-            wire.name, layer, driving, model.direct, priors.places, shapes, time, prompt
-        )
+            wire.name, layer, driving, model.direct, priors.places, shapes, time, prompt,
+            model.reference_of(layer, scaling),
+        )  # fmt: skip
         self._priors = priors
         self._data = [_data(record, self._systems) for record in density.records]
         self._late = None

@@ -41,6 +41,7 @@ class LinearSystems:
         prompt: columns of the inputs that have a direct path, where there is any.
         places: of each site its part of a vector. shapes: of each site.
         time: scale of the training record.
+        reference: the output whose entries of C are positive, where there are several.
     """
 
     name: str
@@ -51,6 +52,7 @@ class LinearSystems:
     shapes: Mapping[str, tuple[int, ...]]
     time: TimeScale
     prompt: tuple[int, ...]
+    reference: int = 0
 
     @property
     def states(self) -> int:
@@ -74,7 +76,7 @@ class LinearSystems:
             noise = self._noise(x)
             self._put(L, poles, noise[..., 0], noise[..., 1] * poles.size[..., None])
         if layer.outputs > 1:
-            _put_direction(C[..., : layer.pairs], self._own(x, "output_gain"))
+            _put_direction(C[..., : layer.pairs], self._own(x, "output_gain"), self.reference)
         if layer.integrators:
             drift = self._integrate(x, lam, B, C, L)
         offset = self._part(x, "offset")
@@ -118,7 +120,7 @@ class LinearSystems:
         self._give(out, f"{self.name}_log_frequency", along * poles.undamped**2)
         if layer.outputs > 1:
             raw = self._own(x, "output_gain")
-            bar = _direction_gradient(raw, systems.C[..., :P], bars.C[..., :P])
+            bar = _direction_gradient(raw, systems.C[..., :P], bars.C[..., :P], self.reference)
             self._give(out, f"{self.name}_output_gain", bar)
         if layer.integrators:
             self._give_integrators(out, bars)
@@ -218,22 +220,24 @@ class LinearSystems:
             self._give(out, f"{self.name}_integrator_noise", self._walked * bars.L.real[:, walk])
 
 
-def _put_direction(C: np.ndarray, raw: np.ndarray) -> None:
-    """Write raw (k, n_y, P, 2) of unit length, first entries real, positive."""
+def _put_direction(C: np.ndarray, raw: np.ndarray, at: int) -> None:
+    """Write raw (k, n_y, P, 2) of unit length, entries of output `at` real, positive."""
     re, im = raw[..., 0], raw[..., 1]
-    first = np.sqrt(re[:, :1] ** 2 + im[:, :1] ** 2)
-    cosine, sine = re[:, :1] / first, -im[:, :1] / first  # of the turn
+    x, y = re[:, at : at + 1], im[:, at : at + 1]
+    first = np.sqrt(x**2 + y**2)
+    cosine, sine = x / first, -y / first  # of the turn
     norm = np.sqrt((re * re + im * im).sum(1, keepdims=True))
     C.real[:] = (re * cosine - im * sine) / norm
     C.imag[:] = (re * sine + im * cosine) / norm
 
 
-def _direction_gradient(raw: np.ndarray, C: np.ndarray, bar: np.ndarray) -> np.ndarray:
+def _direction_gradient(raw: np.ndarray, C: np.ndarray, bar: np.ndarray, at: int) -> np.ndarray:
     """Gradients (k, n_y, P, 2) by raw from those by C = raw exp(-i theta) / |raw|."""
     re, im = raw[..., 0], raw[..., 1]
-    square = (re[:, :1] ** 2 + im[:, :1] ** 2)[:, 0]
+    x, y = re[:, at : at + 1], im[:, at : at + 1]
+    square = (x**2 + y**2)[:, 0]
     first = np.sqrt(square)[:, None]
-    cosine, sine = re[:, :1] / first, -im[:, :1] / first
+    cosine, sine = x / first, -y / first
     norm = np.sqrt((re * re + im * im).sum(1, keepdims=True))
     along = (bar.real * C.real + bar.imag * C.imag).sum(1, keepdims=True) / norm
     across = (bar.imag * C.real - bar.real * C.imag).sum(1)  # by the angle of the turn
@@ -244,7 +248,7 @@ def _direction_gradient(raw: np.ndarray, C: np.ndarray, bar: np.ndarray) -> np.n
         ],
         -1,
     )
-    # The turn is minus the first entry's angle, whose gradient is (-im, re) / |first|^2.
-    out[:, 0, :, 0] += across * im[:, 0] / square
-    out[:, 0, :, 1] -= across * re[:, 0] / square
+    # The turn is minus the angle of entry `at`, whose gradient is (-im, re) / |first|^2.
+    out[:, at, :, 0] += across * im[:, at] / square
+    out[:, at, :, 1] -= across * re[:, at] / square
     return out

@@ -32,8 +32,8 @@ from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 
 FORMAT = "pyro_dynogp.fit"
-# Version 6 is written; 4 and 5 are read, too, which have no digest.
-VERSION, OLDEST, UNMARKED = 6, 4, 5
+# Version 7 is written; 4 to 6 are read, too, of which 4 and 5 have no digest.
+VERSION, OLDEST, UNMARKED = 7, 4, 5
 # The models that a file may name: a file never decides what code is run.
 MODELS = ("Model", "Cascade", "LinearDynamicGP")
 # Arrays of draws with densities, where there are such.
@@ -303,15 +303,15 @@ def _labels(record: Record) -> dict[str, Any]:
     return labels
 
 
-def _record(labels: Mapping[str, Any], tensors: Mapping[str, Tensor], key: str) -> Record:
-    """Inverse of `_arrays` and `_labels`."""
+def _record(labels: Mapping[str, Any], tensors: dict[str, Tensor], key: str) -> Record:
+    """Inverse of `_arrays` and `_labels`; what it copies is taken from the tensors."""
     given = dict(labels)
     if "start" in given:
         instant, zone = given["start"]
         given["start"] = pd.Timestamp(instant).tz_convert(zone)
-    extra = {name: tensors[f"{key}/extra/{name}"].numpy() for name in given["extra_units"]}
+    extra = {name: tensors.pop(f"{key}/extra/{name}").numpy() for name in given["extra_units"]}
     time, inputs, outputs = (
-        tensors[f"{key}/{name}"].numpy() for name in ("time", "inputs", "outputs")
+        tensors.pop(f"{key}/{name}").numpy() for name in ("time", "inputs", "outputs")
     )
     return Record(time, inputs, outputs, extra=extra, **given)
 

@@ -208,6 +208,7 @@ class Model(Structure):
             fed=place.fed,
             integrators=layer.integrators,
             late=tuple(column for column in columns if column < place.channels),
+            reference=self.reference_of(layer, scaling),
         )
 
     @staticmethod

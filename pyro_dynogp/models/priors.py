@@ -5,8 +5,9 @@ and outputs in their standard deviations. The same record in hours or seconds, v
 gives the same posterior.
 
 Gauge: a single output has c_j = 1 (scale and phase of c_j, B_j and L_j are not separately
-identified); several outputs have c_j of unit length with a positive first entry. Each pair is then
-a second-order section, and its gains are given as such a section's numerator,
+identified); several outputs have c_j of unit length, its entry for the reference output of the
+record (`Scaling.reference_output`) positive. Each pair is then a second-order section, and its
+gains are given as such a section's numerator,
 
     G_j(s) = |lambda| (g1 s + g0 |lambda|) / ((s - lambda)(s - conj lambda)),
 
@@ -115,6 +116,7 @@ class ModesPrior:
         time_scale: step and duration of the record [s].
         gain_scale: of the gains of an input a priori.
         priors: "default", or "paper" for flat ones but for the horseshoe.
+        reference: the output whose entries of c are positive, where there are several.
 
     Raises:
         ValueError: on unknown priors, or a record of three samples or fewer.
@@ -134,6 +136,7 @@ class ModesPrior:
     fed: int = 0
     integrators: int = 0
     late: tuple[int, ...] = ()
+    reference: int = 0
 
     def __post_init__(self) -> None:
         verify_fields(self)
@@ -239,7 +242,7 @@ class ModesPrior:
             c = torch.ones(self.pairs, dtype=torch.complex128)
             c = c.expand(poles.shape)
         else:
-            c = unit_direction(_complex(values[f"{name}_output_gain"]))
+            c = unit_direction(_complex(values[f"{name}_output_gain"]), self.reference)
         if self.integrators:
             poles, B, c, L, drift = self._with_integrators(values, poles, B, c, L)
         D = values.get(f"{name}_feedthrough")
@@ -317,8 +320,8 @@ def _section(poles: Tensor, gain: Tensor) -> Tensor:
     return torch.stack(torch.broadcast_tensors(gain[..., 0], gain[..., 1] * size), -1)
 
 
-def unit_direction(raw: Tensor) -> Tensor:
-    """Columns of raw (*b, n_y, P) scaled to unit length, their first entries real, positive."""
-    first = raw[..., :1, :]
+def unit_direction(raw: Tensor, reference: int = 0) -> Tensor:
+    """Columns of raw (*b, n_y, P) of unit length, their entry `reference` real, positive."""
+    first = raw[..., reference : reference + 1, :]
     turned = raw * (first.conj() / first.abs())
     return turned / raw.abs().square().sum(-2, keepdim=True).sqrt()

@@ -131,6 +131,13 @@ class Structure:
         """Whether outputs have a dimension of their own."""
         return self.outputs > 1
 
+    def reference_of(self, layer: Dynamic, scaling: Scaling) -> int:
+        """Place of the signal of a layer by which phases of its modes are told.
+
+        The record's reference output where signals are as many as outputs, else the first one.
+        """
+        return scaling.reference_output if layer.outputs == self.outputs else 0
+
     @property
     def is_linear(self) -> bool:
         """Whether it is one layer of linear dynamics, whatever the noise."""

@@ -137,7 +137,9 @@ def residuals_before_after(report: LoopResult) -> Figure:
                     sign * size, color=style.INPUT, linewidth=1.2, linestyle=(0, (4, 3)),
                     label="root mean square", zorder=4,
                 )  # fmt: skip
-            style.title(panel, _safe(f"{word}: root mean square {size:.3g} {unit}".rstrip()))
+            style.title(
+                panel, _safe(f"{word}: root mean square {size:.3g} {_clipped(unit, 20)}".rstrip())
+            )
         style.label(panel, y=_wrapped(style.named(f"residual of {name}", unit), 24))
     return _finished(figure, axes, clock, "Residuals of the forecast of the sealed data")
 
@@ -183,7 +185,7 @@ def _scored(scores: Mapping[str, float], record: Record) -> str:
     rmse, inside = (scores.get(key, np.nan) for key in ("rmse", "coverage_95"))
     parts = []
     if record.n_outputs == 1 and np.isfinite(rmse):
-        parts.append(f"RMSE {rmse:.3g} {_safe(record.output_units[0])}".rstrip())
+        parts.append(f"RMSE {rmse:.3g} {_safe(_clipped(record.output_units[0], 20))}".rstrip())
     if record.n_outputs == 1 and np.isfinite(inside):
         parts.append(f"95 % band holds {100 * inside:.0f} %")
     return f": {', '.join(parts)}" if parts else ""
@@ -233,10 +235,18 @@ def _safe(text: str) -> str:
     return text.replace("$", r"\$")
 
 
+def _clipped(text: str, most: int) -> str:
+    """Text without its middle where it is longer; the page has it whole."""
+    if len(text) <= most:
+        return text
+    return f"{text[: most - most // 3]}…{text[len(text) - most // 3 + 1 :]}"
+
+
 def _wrapped(text: str, width: int) -> str:
-    """A label in several lines, its unit in one."""
+    """A label in three lines at most, its unit in one."""
     name, bracket, unit = text.partition(" [")
-    whole = name + bracket + unit.replace(" ", "\u00a0")
+    unit = _clipped(unit.replace(" ", "\u00a0"), width - 4)
+    whole = _clipped(name, 2 * width - 4) + bracket + unit
     return _safe(textwrap.fill(whole, width, break_on_hyphens=False))
 
 

@@ -86,13 +86,18 @@ class Checkpoints:
         if self.folder is None:
             return dict(compute())
         path = self.folder / f"{key}.safetensors"
+        advice = "Remove it: what it holds is computed again."
+        marks = {"run": self.fingerprint, "piece": key}
         if path.exists():
-            return read_tensors(path, "checkpoint", "Remove it: what it holds is computed again.")[
-                0
-            ]
+            tensors, texts = read_tensors(path, "checkpoint", advice)
+            if any(texts.get(name) != mark for name, mark in marks.items()):
+                raise ValueError(
+                    f"checkpoint: {path} is another piece, or one of another run. {advice}"
+                )
+            return tensors
         result = dict(compute())
         with _told(self.folder):
-            return write_tensors(path, result, {})
+            return write_tensors(path, result, marks)
 
 
 # For runs that keep nothing.

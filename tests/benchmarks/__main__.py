@@ -30,6 +30,7 @@ from tests.benchmarks import (
     measured,
     planted,
     reference,
+    reliability,
     selection,
     speed,
     thresholds,
@@ -63,6 +64,7 @@ PARTS = {
     "loop_cost": loop_cost.run,
     "paper": paper.run,
     "growth": growth.run,
+    "reliability": reliability.run,
 }
 
 

@@ -1,14 +1,18 @@
 """Refits of the loop on a Dask cluster of two workers, as a user would have it."""
 
 import os
+import signal
+import threading
+import time
 
-import distributed
 import joblib
 import pytest
 
 import pyro_dynogp as dgp
 from pyro_dynogp.support.parallel import parallel_map
 from tests.discrepancy.test_loop import FEW, fitted, machine
+
+distributed = pytest.importorskip("distributed", reason="Dask is not installed")
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +23,7 @@ def cluster():
         ) as workers,
         distributed.Client(workers),
     ):
-        yield
+        yield workers
 
 
 def process(item):
@@ -41,3 +45,36 @@ def test_the_loop_runs_on_a_cluster(cluster):
         )
     assert [one.name for one in report.effects] == ["extra input"]
     assert report.after["rmse"] < 0.06
+
+
+def test_a_loop_whose_worker_is_killed_reports_the_same(cluster):
+    """Dask starts another one, and does what was lost again."""
+    record = machine(weight=0.3)
+    fit, options = fitted(record), {"effects": FEW, "max_rounds": 1, "progress": False}
+    client = distributed.default_client()
+    busy, killed, ended = threading.Event(), [], threading.Event()
+
+    def kill():
+        while not ended.is_set() and not killed:
+            working = [address for address, tasks in client.processing().items() if tasks]
+            if working and busy.is_set():
+                killed.append(client.run(os.getpid, workers=working[:1])[working[0]])
+                os.kill(killed[0], signal.SIGKILL)
+            elif working:
+                busy.set()
+            time.sleep(0.05)
+
+    watch = threading.Thread(target=kill, daemon=True)
+    watch.start()
+    with joblib.parallel_config(backend="dask"):
+        found = dgp.close_loop(fit, record, **options)
+    ended.set()
+    watch.join()
+    assert len(killed) == 1
+    alone = dgp.close_loop(fit, record, workers=1, **options)
+    assert [one.decision for one in found.attempts] == [one.decision for one in alone.attempts]
+    gains = [
+        [one.gain for one in report.attempts if one.gain == one.gain] for report in (found, alone)
+    ]
+    assert gains[0] == gains[1]
+    assert dict(found.after) == dict(alone.after)

@@ -28,6 +28,9 @@ WIDEST = 1.5
 FOLLOWED = 3.0
 # Change of the unconstrained vector over which a gradient's change is its derivative.
 STEP = 1e-4
+# Of `polished`: least curvature of a direction that is followed, longest step and most of them,
+# and a step after which rounding is all that is left.
+CURVED, LONGEST, POLISHING, DONE = 1e-5, 1.0, 60, 1e-6
 
 
 def hessian(
@@ -96,6 +99,33 @@ def newton(
         if not len(active):
             break
     return np.where(gain[:, None] <= gap, z + direction, z), best
+
+
+def polished(functions: Functions, z: np.ndarray) -> tuple[np.ndarray, float]:
+    """Minimum near z (d,), to rounding, and the value there: Newton's method from nearby.
+
+    Directions that hardly curve are left alone: along them nothing is to be found, as where
+    different points are the same model. A step that leads no lower is tried with a quarter of it.
+    """
+    value = float(functions(z[None])[0][0])
+    for _ in range(POLISHING):
+        curvature, axes = np.linalg.eigh(hessian(functions, z))
+        gradient = functions(z[None])[1][0]
+        if not (np.isfinite(curvature).all() and np.isfinite(gradient).all()):
+            break
+        some = curvature > CURVED
+        move = -axes[:, some] @ ((gradient @ axes[:, some]) / curvature[some])
+        longest = float(np.abs(move).max(initial=0.0))
+        move *= min(1.0, LONGEST / max(longest, LONGEST))
+        lengths = 0.25 ** np.arange(6) if longest > DONE else np.ones(1)
+        energies = functions(z + np.multiply.outer(lengths, move))[0]
+        lower = np.flatnonzero(energies <= value + 1e-12 * abs(value))
+        if not len(lower):
+            break
+        z, value = z + lengths[lower[0]] * move, float(energies[lower[0]])
+        if longest <= DONE:
+            break
+    return z, value
 
 
 def _round(functions: Functions, z: np.ndarray) -> np.ndarray | None:

@@ -28,6 +28,7 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.inference.log_joint import Direct
+from pyro_dynogp.inference.optimise.lengths import Lengths
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.wiring import Static
@@ -49,6 +50,8 @@ LEAST = 1e-3
 # A climb ends where so many nats are left to gain by the quadratic form and by the last iteration,
 # or were gained in so many iterations.
 FLAT, PATIENCE = 0.01, 8
+# What a climb says that ended there.
+DONE = "nothing left to gain"
 
 
 def has_innovations(model: object) -> bool:
@@ -100,7 +103,7 @@ class Innovations:
         assert isinstance(potential.log_density, Direct)
         self.potential, self.density = potential, potential.log_density
         self.free = np.arange(potential.size) if free is None else free
-        self._linear = potential.linear
+        self._linear, self._lengths = potential.linear, Lengths(potential.sites)
         self._there = [~torch.isnan(y) for y in self.density.observations]
         model = self.density.model
         states = sum(2 * layer.modes for _, layer in model.dynamic)
@@ -155,13 +158,15 @@ class Innovations:
 
     def _prior(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Energies (k,) of the prior at z (k, d), and their gradients (k, d)."""
+        more, further = self._lengths.energies(z)
         if self._linear is not None:
-            return self._linear.prior_energies(z)
+            energy, gradient = self._linear.prior_energies(z)
+            return energy + more, gradient + further
         x = torch.tensor(z, requires_grad=True)
         with torch.enable_grad(), pyro.validation_enabled(False):
             energies = -self.density.prior.log_prob(self.potential.unpack(x))
             (gradients,) = torch.autograd.grad(energies.sum(), x)
-        return energies.detach().numpy(), gradients.numpy()
+        return energies.detach().numpy() + more, gradients.numpy() + further
 
     def _innovations(self, z: np.ndarray) -> Innovated:
         """Of the measured samples at z (k, d)."""
@@ -236,7 +241,7 @@ def climb(
             damping *= 1e4
         lately = history[-PATIENCE - 1] - history[-1] if len(history) > PATIENCE else np.inf
         if gain < FLAT and (left < FLAT or lately < FLAT):
-            return z, history, "nothing left to gain"
+            return z, history, DONE
         if damping > 1e4 * curvature.max():
             return z, history, "no step gains anything"
     return z, history, "all steps used"

@@ -6,19 +6,23 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.density import Potential, parts
+from pyro_dynogp.inference.log_joint import Direct
 from pyro_dynogp.inference.optimise import gauss_newton
-from pyro_dynogp.inference.optimise.descent import descend, lbfgs
+from pyro_dynogp.inference.optimise.adam import RATE, adam
+from pyro_dynogp.inference.optimise.descent import descend, lbfgs, polished
 from pyro_dynogp.inference.optimise.gauss_newton import has_innovations
+from pyro_dynogp.inference.optimise.lengths import Lengths
 from pyro_dynogp.inference.optimise.lockstep import Functions, in_lockstep
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.layers.sites import Program
+from pyro_dynogp.models.gauge import in_gauge
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import Records, as_measured
 from pyro_dynogp.support.checkpoints import Piece, tensor_text, text_tensor
@@ -27,8 +31,13 @@ from pyro_dynogp.support.parallel import parallel_map, seeded
 # End, energies on the way, why it ended.
 Climb = tuple[np.ndarray, list[float], str]
 Optimizer = Literal["gauss-newton", "lbfgs", "preconditioned", "adam"]
-# Adam's first step, and how often it goes back to the best point with a shorter one.
-RATE, RETURNS = 0.02, 2
+# Decimals of energies [nats] to which two starts are at one optimum: the first of them is kept,
+# whatever rounding says.
+TIED = 6
+# Nats that the last iterations of a climb gained where the top is near.
+NEAR = 0.1
+# Most iterations along a ridge from there.
+RIDGE = 200
 # Starts that climb together, as long as they have no more samples than this in all: longer records
 # keep a processor busy one by one.
 TOGETHER, BATCH_SAMPLES = 4, 8000
@@ -110,45 +119,8 @@ def _preconditioned(functions: Functions, z: np.ndarray, task: _Task, every: int
 
 
 def _adam(functions: Functions, z: np.ndarray, task: _Task, every: int) -> Climb:
-    """Adam with a falling step; back to the best point with a shorter one where it got lost.
-
-    Its first steps have full length in every direction, however good the start is.
-    """
     del every  # of Hessians, of which it has none
-    steps, rate = task.steps, task.rate
-    x, optimizer, schedule = _from(z, rate, steps)
-    history: list[float] = []
-    best, best_z = np.inf, z
-    patience = max(50, steps // 10)
-    since, returns = 0, 0
-    for done in range(steps):
-        here = x.detach().numpy().copy()
-        values, gradients = functions(here[None])
-        value = float(values[0])
-        history.append(value)
-        since += 1
-        if value < best - 1e-3:
-            since = 0
-        if value < best:
-            best, best_z = value, here
-        if since > patience:
-            if returns == RETURNS:
-                return best_z, history, "no improvement of 0.001 nats within the patience"
-            returns, since, rate = returns + 1, 0, rate / 4.0
-            x, optimizer, schedule = _from(best_z, rate, steps - done)
-            continue
-        x.grad = torch.tensor(gradients[0])
-        optimizer.step()
-        schedule.step()
-    return best_z, history, "all steps used"
-
-
-def _from(z: np.ndarray, rate: float, steps: int) -> tuple[Tensor, Any, Any]:
-    """Adam at a point, with a step that falls over the steps that are left."""
-    x = torch.tensor(z, dtype=torch.float64, requires_grad=True)
-    optimizer = torch.optim.Adam([x], lr=rate)
-    low = min(1e-4, 0.1 * rate)
-    return x, optimizer, torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps, eta_min=low)
+    return adam(functions, z, task.steps, task.rate)
 
 
 _METHODS = {"lbfgs": _lbfgs, "preconditioned": _preconditioned, "adam": _adam}
@@ -170,26 +142,60 @@ def _climb(task: _Task) -> list[Optimum]:
 
 def _climbs(potential: Potential, task: _Task) -> tuple[list[Climb], np.ndarray]:
     """Climbs from every start, and the energies (k,) at their ends."""
-    starts = [potential.pack(start).numpy() for start in task.starts]
+    starts = [_placed(potential, potential.pack(start).numpy()) for start in task.starts]
     held = potential.places(task.held)
+    every = potential.hessian_cost  # of a climb, Hessians are at most half the work
+    whole = Lengths(potential.sites).added(potential.values_and_gradients)
+
+    def functions(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        values, gradients = whole(z)
+        gradients[:, held] = 0.0  # no optimizer moves along them
+        return values, gradients
+
     if task.optimizer == "gauss-newton":
         free = np.setdiff1d(np.arange(potential.size), held)
         innovations = gauss_newton.Innovations(potential, free)
         found = [gauss_newton.climb(innovations, z, task.steps) for z in starts]
-        return found, innovations.energies(np.stack([z for z, _, _ in found]))
-    method = _METHODS[task.optimizer]
-    every = potential.hessian_cost  # of a climb, Hessians are at most half the work
+    else:
+        method = _METHODS[task.optimizer]
 
-    def run(z: np.ndarray) -> Callable[[Functions], Climb]:
-        return lambda functions: method(functions, z, task, every)
+        def run(z: np.ndarray) -> Callable[[Functions], Climb]:
+            return lambda functions: method(functions, z, task, every)
 
-    def functions(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        values, gradients = potential.values_and_gradients(z)
-        gradients[:, held] = 0.0  # no optimizer moves along them
-        return values, gradients
-
-    found = in_lockstep(functions, [run(z) for z in starts])
+        found = in_lockstep(functions, [run(z) for z in starts])
+    if getattr(task.model, "is_linear", False):
+        found = [_to_the_top(functions, one, every) for one in found]
+    found = [(_placed(potential, z), history, message) for z, history, message in found]
     return found, potential.values_and_gradients(np.stack([z for z, _, _ in found]))[0]
+
+
+def _to_the_top(functions: Functions, climb: Climb, every: int) -> Climb:
+    """A climb that is all but at an end, with Newton's method from there on.
+
+    Where it stops for want of 0.01 nats depends on rounding, and so on units and order of channels.
+    """
+    z, history, message = climb
+    lately = history[-gauss_newton.PATIENCE - 1 :]
+    slow = len(lately) > gauss_newton.PATIENCE and lately[0] - lately[-1] < NEAR
+    if message != gauss_newton.DONE and not slow:
+        return climb
+    if message != gauss_newton.DONE:
+        z, further, _ = descend(functions, z, RIDGE, every=every, first=0)
+        history = [*history, *further]
+    z, energy = polished(functions, z)
+    return z, [*history, energy], message
+
+
+def _placed(potential: Potential, z: np.ndarray) -> np.ndarray:
+    """The point (d,) that all points share which are the same model, see `in_gauge`."""
+    density = potential.log_density
+    if not isinstance(density, Direct):
+        return z
+    point = torch.tensor(z)
+    shared = in_gauge(density.model, potential.unpack(point), density.records[0].scaling)
+    of_sites = [shared.get(site.name, part) for site, part in parts(potential.sites, point)]
+    placed: np.ndarray = torch.cat([part.reshape(-1) for part in of_sites]).detach().numpy()
+    return placed
 
 
 def _values(potential: Potential, z: np.ndarray) -> dict[str, Tensor]:
@@ -280,7 +286,8 @@ def maximise(
         return [optimum for batch in found for optimum in batch]
 
     def best_first(optima: list[Optimum]) -> list[Optimum]:
-        return sorted(optima, key=lambda optimum: optimum.energy)
+        least = min(optimum.energy for optimum in optima)
+        return sorted(optima, key=lambda optimum: round(optimum.energy - least, TIED))
 
     if len(starts) == 1:
         return climb(starts, steps, "optimum")

@@ -52,8 +52,9 @@ def leading_layers(model: Model) -> tuple[Wire, ...]:
 
 
 def one_output(records: Sequence[PreparedRecord]) -> tuple[PreparedRecord, ...]:
-    """Records with their first output alone."""
-    names = [records[0].record.output_names[0]]
+    """Records with their reference output alone."""
+    reference = records[0].scaling.reference_output
+    names = [records[0].record.output_names[reference]]
     selected = [each.record.select(outputs=names) for each in records]
     scaling = Scaling.from_records(selected)
     return tuple(PreparedRecord.of(record, scaling) for record in selected)

@@ -129,10 +129,11 @@ def values_given_poles(
     if model.several_outputs:
         # The best single direction for each pair: first singular vectors of its residues.
         B = np.zeros((P, n_u), dtype=complex)
+        reference = model.reference_of(layer, scaling)
         for j in range(P):
             if n_u:
                 left, size, right = np.linalg.svd(residues[:, j, :], full_matrices=False)
-                turn = np.exp(-1j * np.angle(left[0, 0]))
+                turn = np.exp(-1j * np.angle(left[reference, 0]))
                 direction[:, j], B[j] = left[:, 0] * turn, size[0] * right[0] / turn
         values[f"{g}_output_gain"] = np.stack([direction.real, direction.imag], -1)
     if layer.integrators:
@@ -151,7 +152,10 @@ def values_given_poles(
         brownian = layer.brownian or n_y
         share = 0.3 * float(spread.mean()) / math.sqrt(P * brownian)
         values[f"{g}_noise_gain_local_scale"] = np.full(P, math.sqrt(share / HORSESHOE_SCALE))
-        unit = np.full((P, brownian, 2), math.sqrt(0.5 * share / HORSESHOE_SCALE))
+        # Each Brownian motion in a direction of its own: if they began alike they would stay so.
+        angle = (np.arange(brownian) + 0.5) * (0.5 * math.pi / brownian)
+        unit = np.stack([np.cos(angle), np.sin(angle)], -1) * math.sqrt(share / HORSESHOE_SCALE)
+        unit = np.tile(unit, (P, 1, 1))
         values[f"{g}_noise_gain_unit"] = unit
         if layer.integrators:
             values[f"{g}_integrator_noise"] = np.full((n_y, brownian), WALKS)

@@ -36,6 +36,7 @@ def start_static(
     x = torch.cat(list(seen))
     d, e, M = one.channels, layer.outputs, layer.inducing
     low, high = x.amin(0), x.amax(0)
+    order = torch.arange(d) if d == e else smoothest_first(seen)
     if reach is not None and line is not None and d == 1:
         # Process noise takes the input further than its mean goes: to where the outputs came from.
         back = (reach - line[1]) / line[0]
@@ -53,12 +54,13 @@ def start_static(
     else:  # where the data are, spread along the record
         index = torch.linspace(0, len(x) - 1, M).round().long()
         cloud = torch.quasirandom.SobolEngine(d).draw(M, dtype=torch.float64) - 0.5
+        cloud = cloud[:, smoothest_first(seen).argsort()]
         values[f"{name}_locations"] = x[index] + 0.1 * (high - low) * cloud
     values[f"{name}_constant"] = torch.zeros(e, dtype=torch.float64)
     values[f"{name}_output_scale"] = torch.full((e,), 1.5, dtype=torch.float64)
     if layer.mean == "linear":
         slope = torch.zeros if fed_back else torch.eye
-        values[f"{name}_slope"] = slope(e, d, dtype=torch.float64)
+        values[f"{name}_slope"] = slope(e, d, dtype=torch.float64)[:, order.argsort()]
     if layer.kernel is None:
         spread = (high - low) / (4.0 if d == 1 else 1.5)
         values[f"{name}_lengthscale"] = spread.clamp(0.1, 10.0)
@@ -67,7 +69,7 @@ def start_static(
     values[f"{name}_values"] = torch.zeros(e, M, dtype=torch.float64)
     function = _function(model, one, layer, values)
     Z = function.locations
-    u = torch.stack([Z[:, o % d] for o in range(e)])
+    u = torch.stack([Z[:, order[o % d]] for o in range(e)])
     if line is not None:
         u = line[0] * u + line[1].unsqueeze(-1)
     if curve is not None and d == 1:
@@ -78,6 +80,18 @@ def start_static(
     function = _function(model, one, layer, values)
     with torch.no_grad():
         return [function.mean(s) for s in seen]
+
+
+def smoothest_first(signals: Sequence[Tensor]) -> Tensor:
+    """Places (d,) of channels by how little they change, in sds, from one sample to the next.
+
+    What a start has for a first or a second channel does then not depend on how they are given.
+
+    Args:
+        signals: (n, d) of each record.
+    """
+    changes = torch.cat([x.diff(dim=0) for x in signals])
+    return (changes.square().mean(0) / torch.cat(list(signals)).var(0)).nan_to_num().argsort()
 
 
 def _function(model: Model, one: Wire, layer: Static, values: Values) -> StaticFunction:

@@ -4,6 +4,7 @@ STYLE = """
 :root { color-scheme: light; }
 * { box-sizing: border-box; }
 body { margin: 0 auto; max-width: 62rem; padding: 1.5rem; background: #fff; color: #1a1a1a;
+  overflow-wrap: anywhere;
   font: 16px/1.5 system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
 h1 { font-size: 1.75rem; line-height: 1.25; margin: .2rem 0 .6rem; overflow-wrap: anywhere; }
 h2 { font-size: 1.3rem; margin: 2.2rem 0 .6rem; border-bottom: 2px solid #0072b2; }
@@ -19,12 +20,17 @@ figure { margin: 1rem 0; }
 figure img, figure svg { display: block; max-width: 100%; height: auto; }
 article img { width: 36rem; }
 figcaption { color: #444; font-size: .9rem; max-width: 46rem; overflow-wrap: anywhere; }
-.wide { overflow-x: auto; margin: .8rem 0 1.2rem; }
+.wide { overflow-x: auto; margin: .8rem 0 1.2rem; background:
+  linear-gradient(to right, #fff 40%, transparent) left / 2.5rem 100% no-repeat local,
+  linear-gradient(to left, #fff 40%, transparent) right / 2.5rem 100% no-repeat local,
+  linear-gradient(to right, #0003, transparent) left / .8rem 100% no-repeat scroll,
+  linear-gradient(to left, #0003, transparent) right / .8rem 100% no-repeat scroll; }
 table { border-collapse: collapse; width: 100%; font-size: .92rem; }
 caption { text-align: left; font-weight: 600; padding: .3rem 0; }
 th, td { text-align: left; vertical-align: top; padding: .35rem .6rem; overflow-wrap: anywhere;
   border-bottom: 1px solid #c8c8c8; }
 thead th { border-bottom: 2px solid #555; vertical-align: bottom; white-space: normal; }
+td:not(.n), thead th:not(.n) { min-width: 7rem; }
 tbody th { font-weight: 400; min-width: 9rem; }
 .n { text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums; }
 td.better { color: #00543b; font-weight: 600; }
@@ -40,7 +46,7 @@ dd { margin: 0; flex: 1; font-variant-numeric: tabular-nums; overflow-wrap: anyw
   body { max-width: none; padding: 0; font-size: 10.5pt; }
   figure, aside, tr, h2, h3 { break-inside: avoid; }
   h2, h3, caption { break-after: avoid; }
-  .wide { overflow: visible; }
+  .wide { overflow: visible; background: none; }
   table { font-size: 9pt; }
   figure img { width: auto; max-height: 215mm; }
   article img { width: 130mm; }
