@@ -19,7 +19,7 @@ Its maximum, and a climb of all other sites with theta held, take turns.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -41,6 +41,8 @@ ROUNDS, STEPS, SETTLED = 4, 15, 0.1
 # Farthest that a parameter goes in one round, in unconstrained units.
 FARTHEST = 1.5
 SEARCH_STEPS = 60
+# Optima of which the evidence chooses.
+CONSIDERED = 2
 
 
 def functions_of(model: Model) -> list[tuple[Wire, Static]]:
@@ -52,6 +54,22 @@ def kernel_sites(model: Model) -> tuple[str, ...]:
     """Names of the sites of all kernels and output scales."""
     each = (model.static_prior(wire, layer).kernel_sites for wire, layer in functions_of(model))
     return tuple(name for names in each for name in names)
+
+
+def kernels_by_evidence(
+    model: Model, records: tuple[PreparedRecord, ...], optima: Sequence[Optimum], run: Run
+) -> list[Optimum]:
+    """Of the leading optima, with kernels by the evidence, the one that has the most of it.
+
+    Joint densities under different kernels do not compare.
+    """
+    leading = [
+        with_kernels_by_evidence(model, records, one, run, f"kernels-{index}")
+        for index, one in enumerate(optima[:CONSIDERED])
+    ]
+    if len(leading) == 1:
+        return leading
+    return [min(leading, key=lambda one: _Expansion.at(model, records, one.values).energy)]
 
 
 def with_kernels_by_evidence(
@@ -187,7 +205,7 @@ class _Expansion:
             with torch.enable_grad():
                 value = -level(x)[0]
                 (slope,) = torch.autograd.grad(value, x)
-            return float(value), slope.numpy()
+            return float(value.detach()), slope.numpy()
 
         begin = self.z[kernels]
         bounds = [(x - FARTHEST, x + FARTHEST) for x in begin]

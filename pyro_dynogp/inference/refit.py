@@ -11,7 +11,7 @@ import torch
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.fitted import Fitted
-from pyro_dynogp.inference.function_evidence import kernel_sites, with_kernels_by_evidence
+from pyro_dynogp.inference.function_evidence import kernel_sites, kernels_by_evidence
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.importance import with_draws_around
 from pyro_dynogp.inference.methods.mode import at_optimum, climb, louder, most_probable
@@ -175,8 +175,7 @@ def _settled(problem: Problem, optima: list[Optimum], run: Run) -> list[Optimum]
     """Optima with kernels by the evidence, with feedback and but for variants that are compared."""
     if run.steps or not problem.target.has_feedback:
         return optima
-    best = with_kernels_by_evidence(problem.target, problem.records, optima[0], run, "kernels")
-    return [best]
+    return kernels_by_evidence(problem.target, problem.records, optima, run)
 
 
 def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:

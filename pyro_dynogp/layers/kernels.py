@@ -26,6 +26,9 @@ from pyro_dynogp.layers.sites import Site, sample
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.tensors import broadcast
 
+# Smoothness by default, and of functions in feedback: a rough one is uncertain between its inducing
+# values, and free runs draw from that again and again.
+ROUGH, SMOOTH = 1.5, 2.5
 MATERN = {0.5: "matern12", 1.5: "matern32", 2.5: "matern52"}
 # Kernels whose GPyTorch code takes parameters with more leading dimensions than they were made
 # with; of all others one batch element is evaluated at a time.
@@ -201,16 +204,16 @@ def _scaled(K: Tensor, variance: Tensor | None, diagonal: bool) -> Tensor:
 
 
 @lru_cache
-def _default_form(channels: int) -> kernels.Kernel:
+def _default_form(channels: int, smoothness: float = ROUGH) -> kernels.Kernel:
     # Shared, and safe to share: a function of the distance is evaluated without touching it.
-    return kernels.MaternKernel(1.5, ard_num_dims=channels).double().requires_grad_(False)
+    return kernels.MaternKernel(smoothness, ard_num_dims=channels).double().requires_grad_(False)
 
 
 @dataclass(frozen=True, eq=False)
 class KernelPrior:
     """Prior of the hyperparameters of a kernel: its sites, and the kernel at their values.
 
-    Sites: for None, which stands for a Matern-3/2 kernel of unit variance, ``<name>_lengthscale``
+    Sites: for None, which stands for a Matern kernel of unit variance, ``<name>_lengthscale``
     (d,), LogNormal(0, 1). For a GPyTorch kernel ``<name>_<parameter>`` with the shape of the
     parameter, of each that requires a gradient: "base_kernel.raw_lengthscale" is
     ``<name>_base_kernel_lengthscale``. Its value is what the parameter means (within its
@@ -221,6 +224,7 @@ class KernelPrior:
         name: prefix of the sites.
         kernel: a GPyTorch kernel without batch shape, copied, never changed; or None.
         channels: d, number of channels of the points.
+        smoothness: nu of the kernel that None stands for: 0.5, 1.5 or 2.5.
 
     Raises:
         ValueError: if `kernel` is something else or has a prior that cannot be a site's.
@@ -229,8 +233,13 @@ class KernelPrior:
     name: str
     kernel: kernels.Kernel | None
     channels: int
+    smoothness: float = ROUGH
 
     def __post_init__(self) -> None:
+        if not isinstance(self.smoothness, float) or self.smoothness not in MATERN:
+            raise invalid("smoothness", expected="0.5, 1.5 or 2.5", got=repr(self.smoothness))
+        if self.kernel is not None and self.smoothness != ROUGH:
+            raise invalid("smoothness", expected="none with a kernel", got=str(self.smoothness))
         if self.kernel is None:
             return
         if not isinstance(self.kernel, kernels.Kernel):
@@ -289,7 +298,7 @@ class KernelPrior:
         """The kernel at values (*b, *shape) of the sites; batch shape *b."""
         if self.kernel is None:
             lengthscale = values[f"{self.name}_lengthscale"].unsqueeze(-2)
-            form = _default_form(self.channels)
+            form = _default_form(self.channels, self.smoothness)
             return SampledKernel(form, {"raw_lengthscale": lengthscale}, self.channels)
         given = {
             parameter: values[self._site(parameter)]

@@ -69,7 +69,7 @@ class StaticPrior:
         channels: d, number of inputs. outputs: e.
         inducing: M, number of inducing locations, where `locations` does not say.
         kernel: a GPyTorch kernel (of unit variance: `output_scale` multiplies it); None for a
-            Matern-3/2 with a lengthscale for each channel.
+            Matern with a lengthscale for each channel, of this `smoothness`.
         mean: "constant", or "linear" for a slope as well.
         learn_locations: whether the locations are learnt; else they stay at the start.
         locations: starting locations (M, d), or (M,) for one channel; by default
@@ -87,6 +87,7 @@ class StaticPrior:
     mean: MeanName = "constant"
     learn_locations: bool = True
     locations: Any = None
+    smoothness: float = 1.5
 
     def __post_init__(self) -> None:
         verify_fields(self)
@@ -106,7 +107,7 @@ class StaticPrior:
     @cached_property
     def kernel_prior(self) -> KernelPrior:
         """Of the kernel's parameters."""
-        return KernelPrior(self.name, self.kernel, self.channels)
+        return KernelPrior(self.name, self.kernel, self.channels, self.smoothness)
 
     @property
     def kernel_sites(self) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ from typing import Unpack
 
 from gpytorch.kernels import Kernel
 
+from pyro_dynogp.layers.kernels import ROUGH, SMOOTH
 from pyro_dynogp.layers.noise import Gaussian, Likelihood
 from pyro_dynogp.lti.modes import NoiseStructure
 from pyro_dynogp.models.model import Model
@@ -222,6 +223,7 @@ def NonlinearFeedback(
 
     Args: as those of `Wiener`; f sees all outputs and has as many, the output measured is g's.
         hidden: number of signals that f2 sees and has as outputs.
+        kernel: of the functions, a gpytorch kernel; Matern-5/2 by default.
 
     Example:
         >>> model = NonlinearFeedback(1, pairs=1)
@@ -230,14 +232,20 @@ def NonlinearFeedback(
     """
     verify(hidden=hidden)
     back = ("f1", "f2") if hidden else ("f",)
+    smoothness = SMOOTH if kernel is None else ROUGH
     layers: list[Layer] = [
         Dynamic(
             outputs=outputs, pairs=pairs, process_noise=process_noise, feedback=back, hidden=hidden
         ),
-        Static(outputs=outputs, inducing=inducing, kernel=kernel),
+        Static(outputs=outputs, inducing=inducing, kernel=kernel, smoothness=smoothness),
     ]
     if hidden:
-        layers.append(Static(outputs=hidden, inducing=inducing, kernel=kernel, sees=("g_hidden",)))
+        layers.append(
+            Static(
+                outputs=hidden, inducing=inducing, kernel=kernel, sees=("g_hidden",),
+                smoothness=smoothness,
+            )
+        )  # fmt: skip
     looped: ModelOptions = {"integrate": "all", "output": "g", **options}
     return Model(inputs, tuple(layers), likelihood or Gaussian(), **looped)
 

@@ -81,7 +81,8 @@ class Static:
 
     Args:
         outputs: width of the layer. inducing: number of inducing values for each output.
-        kernel: a gpytorch kernel; Matern-3/2 with a lengthscale for each channel by default.
+        kernel: a gpytorch kernel; by default Matern with a lengthscale for each channel.
+        smoothness: nu of the default kernel, 0.5, 1.5 or 2.5.
         mean: "linear" or "constant" prior mean; by default linear for a first layer, in feedback
             from several signals and where there are limits, else constant. Beyond the data a
             function goes back to it; in feedback from one signal it keeps its value, so that what
@@ -105,6 +106,7 @@ class Static:
     learn_locations: bool = True
     support: int = 64
     name: str | None = None
+    smoothness: float = 1.5
 
 
 @dataclass(frozen=True)

@@ -222,6 +222,7 @@ class Model(Structure):
             kernel=layer.kernel,
             mean=layer.mean or "constant",
             learn_locations=layer.learn_locations,
+            smoothness=layer.smoothness,
         )
 
     def _has_residual(self, place: Wire) -> bool:

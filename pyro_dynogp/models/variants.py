@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from pyro_dynogp.data.channels import Channel, count_direct
+from pyro_dynogp.layers.kernels import SMOOTH
 from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.wiring import (
@@ -126,6 +127,11 @@ def with_input_function(model: Model) -> Model | None:
     return replace(model, layers=(first, *model.layers), scaling=None, output=None)
 
 
+def _smooth(name: str, sees: tuple[str, ...], outputs: int) -> Static:
+    """A function in feedback."""
+    return Static(outputs, inducing=INDUCING, name=name, sees=sees, smoothness=SMOOTH)
+
+
 def with_feedback(model: Model, *, output: bool = True, hidden: bool = False) -> Model | None:
     """The model with static layers that see its last dynamic layer and act back on it.
 
@@ -145,9 +151,9 @@ def with_feedback(model: Model, *, output: bool = True, hidden: bool = False) ->
     own, unseen = (seen.name,), (seen.name + HIDDEN,)
     back = []
     if output and own not in before:
-        back.append(Static(outputs=layer.outputs, inducing=INDUCING, name=FEEDBACK, sees=own))
+        back.append(_smooth(FEEDBACK, own, layer.outputs))
     if hidden and unseen not in before:
-        back.append(Static(inducing=INDUCING, name=HIDDEN_FEEDBACK, sees=unseen))
+        back.append(_smooth(HIDDEN_FEEDBACK, unseen, 1))
     if not back or (model.has_feedback and not layer.feedback):
         return None
     names = (*layer.feedback, *(str(one.name) for one in back))

@@ -241,7 +241,7 @@ def test_models_without_functions_stay():
 
 
 def test_free_runs_of_a_default_fit_keep_to_the_spring():
-    """Draws of the joint mode's kernel spread several times too far, and half of them nearly all."""
+    """Draws under the joint mode's kernel spread so far that 50 % bands hold 97 %."""
     plant = simulate_duffing(0, noise_ratio=0.01)
     fit = dgp.fit(dgp.NonlinearFeedback(1), plant.train, workers=1, progress=False, restarts=2)
     found = dgp.scores(fit.forecast(plant.train, plant.test, seed=0), plant.test)

@@ -13,7 +13,7 @@ import numpy as np
 from pyro_dynogp.inference.density import WALL, Potential
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.free_runs import free_run_error, noise_pays, silenced
-from pyro_dynogp.inference.function_evidence import with_kernels_by_evidence
+from pyro_dynogp.inference.function_evidence import kernels_by_evidence
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.optimise.gauss_newton import has_innovations
 from pyro_dynogp.inference.optimise.maximum import (
@@ -173,7 +173,7 @@ def best_optima(
             "record for jumps of many orders of magnitude, or try fewer pairs."
         )
     if model.has_feedback:
-        optima = [with_kernels_by_evidence(problem.target, records, optima[0], run, "kernels")]
+        optima = kernels_by_evidence(problem.target, records, optima, run)
     return optima
 
 
