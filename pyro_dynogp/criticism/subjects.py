@@ -128,9 +128,12 @@ class FitSubject:
 
     @property
     def carries(self) -> bool:
-        """Whether draws can be moved to other data without a fit, as `carried` does."""
-        known = self.parameters == "mode" or self.fit.model.has_function
-        return self.fit.method in ("map", "importance") and not known
+        """Whether draws can be moved to other data without a fit, as `carried` does.
+
+        Of a model with static functions draws of all parameters can; its mode has none.
+        """
+        ways = ("importance",) if self.fit.model.has_function else ("map", "importance")
+        return self.fit.method in ways and self.parameters != "mode"
 
     def carried(self, left_out: np.ndarray) -> FitSubject:
         """As `without`, by these draws moved to the posterior given those data."""

@@ -110,7 +110,11 @@ class Normal:
         """The normals around the best optima, and draws of them."""
         model = problem.model
         climbs = None if model.is_linear else run.steps
-        optima = best_optima(problem, run, self.optimizer, climbs)
+        return self.around(problem, best_optima(problem, run, self.optimizer, climbs), run)
+
+    def around(self, problem: Problem, optima: Sequence[Optimum], run: Run) -> Fitted:
+        """The same, of optima that are found, the best first."""
+        model = problem.model
         family = self.family_for(model)
         steps = run.steps or (POLISH if model.has_function else 1000)
         found = posterior_of(
