@@ -1,9 +1,8 @@
 """`dgp.loo` of models with functions against draws of all parameters that never saw the sample.
 
-For some of the samples the posterior given all others is drawn by a sampler of its own: particles
-of the prior, many times as many as a fit has, annealed to it, and chains from them. Environment
-variables: LOO_SAMPLES (60), LOO_EVERY (6, one in so many samples is left out by brute force),
-LOO_PARTICLES (600).
+For some of the samples the posterior given all others is drawn again, with several times as many
+particles and moves as a fit has. Environment variables: LOO_SAMPLES (60), LOO_EVERY (6, one in so
+many samples is left out by brute force), LOO_TIMES (4, particles and moves over those of a fit).
 """
 
 from __future__ import annotations
@@ -16,22 +15,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from scipy.special import logsumexp
 
 import pyro_dynogp as dgp
 from pyro_dynogp.criticism.left_out import monte_carlo_error
 from pyro_dynogp.criticism.subjects import FitSubject
-from pyro_dynogp.inference.density import Potential
-from pyro_dynogp.inference.function_sampling import Island
-from pyro_dynogp.inference.importance_sampling import from_prior
-from pyro_dynogp.inference.posterior_draws import PosteriorDraws
-from pyro_dynogp.support.frozen import FrozenMapping
+from pyro_dynogp.inference.function_sampling import sample_functions
 from tests.benchmarks.brute_force import records
 from tests.benchmarks.coverage import linear_record
 
 QUIET: dict[str, Any] = {"workers": 1, "progress": False}
-LONG_CHAINS = 60
 
 
 def fits(n: int) -> dict[str, dgp.Fit]:
@@ -47,29 +40,25 @@ def fits(n: int) -> dict[str, dgp.Fit]:
     }
 
 
-def draws_without(fit: dgp.Fit, i: int, particles: int, seed: int) -> FitSubject:
-    """Draws of the posterior given all samples but one, by annealing from the prior alone."""
+def draws_without(fit: dgp.Fit, i: int, times: int, seed: int) -> FitSubject:
+    """Draws of the posterior of all parameters given all samples but one."""
     (record,) = fit.records
     y = record.outputs.copy()
     y[i] = np.nan
     prepared = tuple(fit.model.prepare((record.with_outputs(y),)))
-    plain = Potential(fit.model.collapsed, (prepared,), dict(fit.mode))
-    (run,) = from_prior(plain, particles, len(record), seed, False)
-    found = Island(run, plain, None).chains(LONG_CHAINS, len(record), seed)
-    with torch.no_grad():
-        values = FrozenMapping(plain.unpack(found.z.flatten(0, 1)))
-    chain = np.tile(np.arange(LONG_CHAINS), len(found.z))
-    drawn = PosteriorDraws(values, None, None, np.zeros(len(chain), int), "annealed", chain)
-    return FitSubject(fit, fit.records, 0, seed, drawn=drawn)
+    found, _ = sample_functions(
+        fit.model.collapsed, prepared, [dict(fit.mode)], seed=seed, times=times
+    )
+    return FitSubject(fit, fit.records, 0, seed, drawn=found.draws)
 
 
 def exact(
-    fit: dgp.Fit, chosen: Sequence[int], particles: int, seed: int = 9
+    fit: dgp.Fit, chosen: Sequence[int], times: int, seed: int = 9
 ) -> tuple[np.ndarray, float]:
     """Log-densities of chosen samples given all others, and the standard error of their sum."""
     found, errors = [], []
     for i in chosen:
-        subject = draws_without(fit, i, particles, seed)
+        subject = draws_without(fit, i, times, seed)
         density = subject.pointwise("missing sample")[:, [i]]
         plain = np.full(len(density), -np.log(len(density)))
         one = float(logsumexp(plain + density[:, 0]))
@@ -83,9 +72,9 @@ def exact(
 def run(folder: Path) -> str:
     """The table."""
     del folder
-    n, every, particles = (
+    n, every, times = (
         int(os.environ.get(name, usual))
-        for name, usual in (("LOO_SAMPLES", 60), ("LOO_EVERY", 6), ("LOO_PARTICLES", 600))
+        for name, usual in (("LOO_SAMPLES", 60), ("LOO_EVERY", 6), ("LOO_TIMES", 4))
     )
     lines = [
         "| model | samples | loo, all | loo, of these | brute force | difference | stated error, "
@@ -99,7 +88,7 @@ def run(folder: Path) -> str:
             hook = dgp.loo(fit, target="missing sample", **QUIET)
             spent = time.process_time() - begin
             chosen = np.arange(every // 2, n, every)
-            real, own_error = exact(fit, chosen.tolist(), particles)
+            real, own_error = exact(fit, chosen.tolist(), times)
             ours = hook.loo_i.values[chosen]
             error, again, left = (
                 hook[key] for key in ("monte_carlo_error", "refits", "not_refitted")

@@ -1,4 +1,4 @@
-"""Draws of all parameters of models with static functions: densities, moments, which way is taken."""
+"""Draws of all parameters of models with functions: densities, moments, which way is taken."""
 
 import dataclasses
 import warnings
@@ -10,15 +10,14 @@ import torch
 import pyro_dynogp as dgp
 from pyro_dynogp.inference import function_sampling
 from pyro_dynogp.inference.cascade_coordinates import StraightPotential
-from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.function_sampling import (
     CHAINS,
+    DOUBT,
     Island,
     NoDrawsError,
     sample_functions,
     shares,
 )
-from pyro_dynogp.inference.importance_sampling import from_prior
 from pyro_dynogp.inference.log_joint import log_joint_of
 from pyro_dynogp.inference.methods.annealed import Annealed, Joint
 from tests.inference.cascades import wiener, wiener_record
@@ -64,19 +63,14 @@ def test_draws_have_the_density_that_is_said(fit):
     np.testing.assert_array_equal(np.unique(source.ancestor), np.arange(CHAINS))
 
 
-def test_moments_are_those_of_a_long_run_from_the_prior(fit):
-    """Many more particles, and nothing but the prior to begin with."""
-    model, records, _ = arguments(fit)
-    plain = Potential(model, (records,), dict(fit.mode))
-    (run,) = from_prior(plain, 1600, 60, 5, False)
-    long = Island(run, plain, None).chains(80, 60, 3)
-    exact = plain.unpack(long.z.flatten(0, 1))
-    for name in ("noise_sd", "g_log_decay", "g_log_frequency"):
-        if name not in exact:
-            continue
-        one, other = fit.posterior.source.values[name], exact[name]
-        sd = other.std(0)
-        assert bool(((one.mean(0) - other.mean(0)).abs() < 1.0 * sd).all()), name
+def test_moments_are_those_of_a_longer_run(fit):
+    """Four times as many particles and moves: means within one posterior sd."""
+    long, _ = sample_functions(*arguments(fit), seed=5, times=4)
+    for name in ("noise_sd", "offset"):
+        one, other = fit.posterior.source.values[name], long.draws.values[name]
+        assert bool(((one.mean(0) - other.mean(0)).abs() < other.std(0)).all()), name
+        assert bool((one.std(0) < 3.0 * other.std(0)).all()), name
+        assert bool((one.std(0) > other.std(0) / 3.0).all()), name
 
 
 def island(log_evidence, level=0.0):
@@ -85,7 +79,8 @@ def island(log_evidence, level=0.0):
 
 
 def test_runs_that_found_more_evidence_begin_more_chains():
-    assert shares([island(-3.0), island(-3.0 + np.log(3.0))]) == [CHAINS // 4, 3 * CHAINS // 4]
+    more = DOUBT * np.log(3.0)
+    assert shares([island(-3.0), island(-3.0 + more)]) == [CHAINS // 4, 3 * CHAINS // 4]
     assert shares([island(-80.0), island(0.0)]) == [0, CHAINS]
 
 
@@ -145,12 +140,12 @@ class TestWays:
 
 
 def test_bands_hold_where_those_of_functions_alone_do_not():
-    """Two Wiener plants of 100 samples, the last of ten by the present and the former default."""
+    """A Wiener plant of 100 samples, by the present and the former default."""
     from tests.benchmarks.coverage import CASES, linear_record
 
     shares_of = {"importance": [], "svi": []}
     crps = {"importance": [], "svi": []}
-    for seed in (5008, 5009):
+    for seed in (5009,):
         make, bent = CASES["wiener"]
         train, test = linear_record(seed, 100, **bent)
         for method in shares_of:

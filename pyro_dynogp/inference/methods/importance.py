@@ -31,7 +31,8 @@ class Importance:
     weights by the posterior. Where Pareto's k of the weights is too high, rounds of draws shape the
     distributions (of models under Gaussian noise); where it stays too high, draws are annealed to
     the posterior (`inference.importance_sampling`; of models with static functions
-    `inference.function_sampling`, from the prior, too, where a record has 150 samples or fewer).
+    `inference.function_sampling`, along 150 samples or fewer, 250 with feedback, from the prior,
+    too).
     Bands then know the uncertainty of every parameter, and each optimum has its posterior
     probability.
 
