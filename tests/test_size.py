@@ -15,9 +15,10 @@ LINES = 31_500
 # lines), integrators (450 lines), checks of arguments, two effects (330 lines), a closed loop that
 # does no harm (510 lines), forecasts in `check` (120 lines) and densities of linear models without
 # torch (1640 lines), the filter's kernels and moments of functions in lanes (480 lines), hidden
-# signals (180 lines), dead times with a posterior (1230 lines) and simulated plants with feedback
-# (320 lines) came since. To shrink, and to go.
-LINES_TODAY = 45_700
+# signals (180 lines), dead times with a posterior (1230 lines), simulated plants with feedback
+# (320 lines) and draws of all parameters of models with functions (430 lines) came since. To
+# shrink, and to go.
+LINES_TODAY = 46_130
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()
