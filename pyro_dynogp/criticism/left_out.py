@@ -137,19 +137,9 @@ def missing_sample(subject: Subject, most: int, workers: int | None, progress: b
     return found
 
 
-def _without_one(subject: Subject, left_out: np.ndarray) -> Subject:
-    """The subject without one sample (N,).
-
-    A fit of a model with static functions would climb to one optimum again, of which the posterior
-    may have several: its draws are moved on instead, which costs less, too.
-    """
-    if isinstance(subject, FitSubject) and subject.fit.model.has_function and subject.carries:
-        return subject.carried(left_out)
-    return subject.without(left_out)
-
-
 def _one_left_out(subject: Subject, i: int, N: int) -> float:
-    other = _without_one(subject, np.arange(N) == i)
+    without = subject.moved if isinstance(subject, FitSubject) else subject.without
+    other = without(np.arange(N) == i)
     density = other.pointwise("missing sample")[:, i]
     return float(logsumexp(Base.of(other).log_weights + density))
 

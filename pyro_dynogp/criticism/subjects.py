@@ -140,6 +140,14 @@ class FitSubject:
         fit = replace(self.fit, records=tuple(self._rest(left_out)))
         return replace(self, fit=fit, drawn=carried(self.fit, self.draws, fit, seed=self.seed))
 
+    def moved(self, left_out: np.ndarray) -> FitSubject:
+        """As `without`, of a model with static functions `carried` where that is possible.
+
+        Its refit climbs to one optimum, of which the posterior may have several, and costs more.
+        """
+        moves = self.fit.model.has_function and self.carries
+        return self.carried(left_out) if moves else self.without(left_out)
+
     def _rest(self, left_out: np.ndarray) -> list[Record]:
         """The records without some samples (N,)."""
         rest = []
