@@ -225,8 +225,9 @@ def fit(
             with dead times that are parameters (`Delayed`) outputs are missing in the fit until the
             first input of the record is likely to have arrived, a quarter of it at most.
         method: "importance", "map", "svi", "nuts", or an object with options of its own:
-            `Importance`, `Mode`, `Normal`, `Nuts`, `Trajectories`. By default "svi" where the model
-            has static layers, else "importance".
+            `Importance`, `Mode`, `Normal`, `Nuts`, `Trajectories`. By default "importance"; "svi"
+            with ``guide``, and of models with static layers where one of ``hyperparameters``,
+            ``particles``, ``learning_rate`` is given.
         start: a fit to start from beside the restarts: of the same model to other data, or of a
             model that this one extends (what sites have in common is taken over).
         seed: the same seed gives the same numbers to the last bit on one machine.

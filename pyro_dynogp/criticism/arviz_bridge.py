@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -59,7 +60,30 @@ def elpd_data(
 
 def _elpd(entries: Mapping[str, Any]) -> Any:
     """ArviZ's class of these entries, in their order."""
-    return _arviz().stats.stats_utils.ELPDData(data=list(entries.values()), index=list(entries))
+    return _elpd_class()(data=list(entries.values()), index=list(entries))
+
+
+@cache
+def _elpd_class() -> Any:
+    """ArviZ's ELPDData, whose text also says what the draws are of, and the notes."""
+
+    class Elpd(_arviz().stats.stats_utils.ELPDData):  # type: ignore[misc]
+        def __str__(self) -> str:
+            lines = [super().__str__()]
+            if "drawn" in self:
+                lines += ["", f"Draws of {self['drawn']} ({self['draws_from']})."]
+                lines += [f"Fits or draws made again: {self['refits']}.", *self["notes"]]
+            return "\n".join(lines)
+
+    Elpd.__qualname__ = "Elpd"  # pickle finds it by `__getattr__` below
+    return Elpd
+
+
+def __getattr__(name: str) -> Any:
+    """The class of results, which needs ArviZ: for pickle, that looks for it here."""
+    if name == "Elpd":
+        return _elpd_class()
+    raise AttributeError(name)
 
 
 ARVIZ_ENTRIES = (

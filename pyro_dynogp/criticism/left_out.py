@@ -138,7 +138,8 @@ def missing_sample(subject: Subject, most: int, workers: int | None, progress: b
 
 
 def _one_left_out(subject: Subject, i: int, N: int) -> float:
-    other = subject.without(np.arange(N) == i)
+    without = subject.moved if isinstance(subject, FitSubject) else subject.without
+    other = without(np.arange(N) == i)
     density = other.pointwise("missing sample")[:, i]
     return float(logsumexp(Base.of(other).log_weights + density))
 
@@ -149,8 +150,8 @@ def forecast(
     """Forwards through the record: ratios take in what came since the last fit, until a refit.
 
     Draws given less data are wider than what they stand for, and have not seen what is forecast.
-    Around the mode of a model without static functions there is one fit, to the past of the first
-    forecast; later its draws are moved on to more data. Where no refit is allowed, ratios take the
+    Where draws are of all parameters there is one fit, to the past of the first forecast; later its
+    draws are moved on to more data. Where no refit is allowed, ratios take the
     future out of the draws given all data instead.
     """
     places = subject.places
@@ -323,6 +324,6 @@ def _note(found: Found, subject: Subject) -> None:
     if "at each optimum" in subject.draws.kind:
         found.notes.append(
             "Poles, gains, noise and lengthscales are at their optimum, which has seen the data: "
-            "fit with hyperparameters='multivariate normal' or method='nuts', or use "
-            "target='new record', to count what they cost."
+            "fit with method='importance' (the default along 1000 samples or fewer) or 'nuts', or "
+            "use target='new record', to count what they cost."
         )

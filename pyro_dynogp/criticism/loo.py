@@ -64,15 +64,16 @@ def loo(
             long that parameters are all but known.
         refits: most fits that are made again where Pareto's k is above ArviZ's good_k. Forecasts
             begin with a fit to the past of the first one, and go on from it by ratios that take in
-            what came since. Where these fail the draws around a mode of a model without static
-            functions are moved to more data, which counts as a refit; 0 has them take the future
-            out of the draws given all data instead, which flatters. "new record" makes one for each
-            fold whatever this says.
+            what came since. Where these fail draws of all parameters are moved to more data, which
+            counts as a refit, as where a model with static functions leaves single samples out; 0
+            has forecasts take the future out of the draws given all data, which flatters. "new
+            record" makes one for each fold whatever this says.
         seed: for the draws. workers: processes for refits. progress: whether to show a bar.
 
     Returns:
         ELPDData with ArviZ's entries (elpd_loo, se, p_loo, pareto_k, loo_i, ...) and: `target`,
-        `horizon`, `data` (fingerprint), `draws_from`, `posterior_k` (Pareto's k of the posterior
+        `horizon`, `data` (fingerprint), `draws_from`, `drawn` (the parameters whose uncertainty
+        is counted; ``print`` says it, too), `posterior_k` (Pareto's k of the posterior
         itself), `corrected` (whether ratios p/q enter: not where posterior_k is too high),
         `monte_carlo_error` of elpd_loo [nats], `refits`, `not_refitted`, `notes`. `loo_i` has the
         coordinates record, sample and output. `se` takes samples as independent: `compare` has
@@ -130,6 +131,15 @@ def subject_of(
     return FitSubject(fit, fit.records, draws, seed, parameters, progress)
 
 
+def _drawn(subject: Subject) -> str:
+    """The parameters whose uncertainty is counted, in words."""
+    if isinstance(subject, FitSubject) and subject.parameters == "mode":
+        return "no parameter: all are at the mode"
+    if "at each optimum" in subject.draws.kind:
+        return "inducing values and first states alone"
+    return "all parameters"
+
+
 def _elpd(subject: Subject, found: Found, target: str, horizon: int) -> Any:
     count = len(subject.draws)
     if found.left:
@@ -150,6 +160,7 @@ def _elpd(subject: Subject, found: Found, target: str, horizon: int) -> Any:
             "horizon": horizon,
             "data": subject.data,
             "draws_from": subject.draws.kind,
+            "drawn": _drawn(subject),
             "posterior_k": found.base.k,
             "corrected": found.base.corrected,
             "monte_carlo_error": found.error,

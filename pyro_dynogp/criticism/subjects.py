@@ -128,14 +128,25 @@ class FitSubject:
 
     @property
     def carries(self) -> bool:
-        """Whether draws can be moved to other data without a fit, as `carried` does."""
-        known = self.parameters == "mode" or self.fit.model.has_function
-        return self.fit.method in ("map", "importance") and not known
+        """Whether draws can be moved to other data without a fit, as `carried` does.
+
+        Of a model with static functions draws of all parameters can; its mode has none.
+        """
+        ways = ("importance",) if self.fit.model.has_function else ("map", "importance")
+        return self.fit.method in ways and self.parameters != "mode"
 
     def carried(self, left_out: np.ndarray) -> FitSubject:
         """As `without`, by these draws moved to the posterior given those data."""
         fit = replace(self.fit, records=tuple(self._rest(left_out)))
         return replace(self, fit=fit, drawn=carried(self.fit, self.draws, fit, seed=self.seed))
+
+    def moved(self, left_out: np.ndarray) -> FitSubject:
+        """As `without`, of a model with static functions `carried` where that is possible.
+
+        Its refit climbs to one optimum, of which the posterior may have several, and costs more.
+        """
+        moves = self.fit.model.has_function and self.carries
+        return self.carried(left_out) if moves else self.without(left_out)
 
     def _rest(self, left_out: np.ndarray) -> list[Record]:
         """The records without some samples (N,)."""

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.inference.density import Potential
-from pyro_dynogp.inference.optimise.maximum import Optimum
+from pyro_dynogp.inference.optimise.optimum import Optimum
 from pyro_dynogp.inference.starts.poles import grown
 from pyro_dynogp.lti.arithmetic import SEGMENT
 from pyro_dynogp.models.assembly import assemble

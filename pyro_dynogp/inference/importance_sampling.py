@@ -144,7 +144,7 @@ def sample_around(
         order = PairOrder.around(potential, proposal.loc[0].numpy())
         target = Joint(potential, samples, order)
         several = potential.linear is not None  # others cost too much for more than one round
-        enough, rounds = (_enough, ROUNDS) if several else (_good, 1)
+        enough, rounds = (enough_draws, ROUNDS) if several else (_good, 1)
         found = adapt(proposal, target.log_prob, count, seed, enough, rounds)
         kind = f"Student-t around {plural(len(weights))}"
         trusted = found.settled
@@ -194,7 +194,7 @@ def _good(found: Adapted) -> bool:
     return found.k <= good_k(len(found.z))
 
 
-def _enough(found: Adapted) -> bool:
+def enough_draws(found: Adapted) -> bool:
     """The same, with as many effective draws as another round may be worth."""
     return _good(found) and found.effective >= min(ENOUGH, 0.25 * len(found.z))
 
@@ -209,11 +209,16 @@ def _resampled(found: Adapted, count: int, order: PairOrder | None) -> Annealed:
 
 
 def run_of(
-    start: StudentMixture | Prior, z: Tensor, target: Joint, seed: int, progress: bool
+    start: StudentMixture | Prior,
+    z: Tensor,
+    target: Joint,
+    seed: int,
+    progress: bool,
+    base: Tensor | None = None,
 ) -> list[Annealed]:
     """One run of annealing; none where particles cannot get from the start to the posterior."""
     try:
-        run = anneal(z, start, target, seed=seed, progress=progress)
+        run = anneal(z, start, target, seed=seed, progress=progress, base=base)
     except RuntimeError:  # Pareto's k of the draws that there are then says how good they are
         return []
     if target.order is None:
@@ -264,16 +269,20 @@ def weighed(potential: Potential, optima: Sequence[Values]) -> tuple[list[Values
     return [different[index] for index in order], weights
 
 
-def proposal_of(potential: Potential, optima: Sequence[Values], weights: Tensor) -> StudentMixture:
+def proposal_of(
+    potential: Potential, optima: Sequence[Values], weights: Tensor, steps: int = STEPS
+) -> StudentMixture:
     """Student-t distributions around optima, in the coordinates of a potential.
+
+    Each centre is what so many steps lead to.
 
     Pairs of all optima are in the order that those of the first have.
     """
-    found = [potential.laplace(optima[0], STEPS)]
+    found = [potential.laplace(optima[0], steps)]
     order = PairOrder.around(potential, found[0][0])
     for values in optima[1:]:
         ordered = values if order is None else order.put(potential, values)
-        found.append(potential.laplace(ordered, STEPS))
+        found.append(potential.laplace(ordered, steps))
     return StudentMixture(
         weights,
         torch.stack([torch.as_tensor(centre) for centre, _ in found]),

@@ -18,13 +18,8 @@ from pyro_dynogp.inference.methods.mode import at_optimum, climb, louder, most_p
 from pyro_dynogp.inference.methods.nuts import sample_posterior
 from pyro_dynogp.inference.methods.optima import POLISH, Hyperparameters, posterior_of
 from pyro_dynogp.inference.methods.svi import Schedule
-from pyro_dynogp.inference.optimise.maximum import (
-    Effort,
-    Optimum,
-    maximise,
-    optimizer_for,
-    optimizer_near,
-)
+from pyro_dynogp.inference.optimise.maximum import Effort, maximise, optimizer_for, optimizer_near
+from pyro_dynogp.inference.optimise.optimum import Optimum
 from pyro_dynogp.inference.posteriors import Mixture, Sampled, draws_of_guide
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.dynamic import Values

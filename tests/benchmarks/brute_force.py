@@ -22,7 +22,7 @@ from pyro_dynogp.criticism.subjects import FitSubject, observed_of
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.optima import posterior_of
 from pyro_dynogp.inference.methods.svi import Schedule
-from pyro_dynogp.inference.optimise.maximum import Optimum
+from pyro_dynogp.inference.optimise.optimum import Optimum
 from pyro_dynogp.inference.pareto import good_k, psis
 from pyro_dynogp.inference.refit import optima_of, refit
 from pyro_dynogp.inference.run import Run

@@ -12,13 +12,8 @@ from scipy.stats import f
 import pyro_dynogp as dgp
 from pyro_dynogp.criticism.left_out import spread_of
 from pyro_dynogp.inference.density import Potential
-from pyro_dynogp.inference.methods.annealed import (
-    ACCEPTANCE,
-    CHANGE,
-    Joint,
-    _next_size,
-    anneal,
-)
+from pyro_dynogp.inference.methods.annealed import Joint, anneal
+from pyro_dynogp.inference.methods.moves import ACCEPTANCE, CHANGE, chains_from, next_size, root_of
 from pyro_dynogp.inference.student_mixture import FREEDOM, StudentMixture
 
 
@@ -215,10 +210,10 @@ def test_step_sizes_are_those_at_which_moves_would_be_accepted(seed):
     factor = (2.4 * torch.rand(200, generator=generator, dtype=torch.float64) - 1.2).exp()
     for c in (0.02, 0.3, 5.0, 40.0):
         chance = torch.erfc(c * (0.5 * factor).square())
-        size = _next_size(0.5, factor, chance)
+        size = next_size(0.5, factor, chance)
         assert math.erfc(c * size**2) == pytest.approx(ACCEPTANCE, abs=1e-4) or size == 1.5
-    assert _next_size(0.5, factor, torch.zeros(200).double()) == pytest.approx(0.5 * CHANGE[0])
-    assert _next_size(0.1, factor, torch.ones(200).double()) == pytest.approx(0.1 * CHANGE[1])
+    assert next_size(0.5, factor, torch.zeros(200).double()) == pytest.approx(0.5 * CHANGE[0])
+    assert next_size(0.1, factor, torch.ones(200).double()) == pytest.approx(0.1 * CHANGE[1])
 
 
 def test_steps_that_are_far_too_long_at_first_are_shortened_at_once():
@@ -228,3 +223,48 @@ def test_steps_that_are_far_too_long_at_first_are_shortened_at_once():
     assert found.log_evidence == pytest.approx(0.0, abs=0.8)
     assert np.mean(found.acceptance[1:]) == pytest.approx(ACCEPTANCE, abs=0.08)
     assert float(found.z.std()) == pytest.approx(1e-3, rel=0.2)
+
+
+class TestChains:
+    def test_moments_and_r_hat_of_a_known_normal(self):
+        """From its own covariance's root; began far out, the chains forget it."""
+        root = tensor([[2.0, 0.0], [1.5, 0.5]])
+        inverse = torch.linalg.inv(root)
+        target = Known(lambda z: standard(z @ inverse.mT))
+        found = chains_from(4.0 * normal(40, 2), target, root, burnt=30, kept=60, seed=1)
+        assert found.z.shape == (60, 40, 2)
+        z = found.z.flatten(0, 1)
+        np.testing.assert_allclose(z.mean(0), 0.0, atol=0.15)
+        np.testing.assert_allclose(torch.cov(z.mT), root @ root.mT, rtol=0.12)
+        assert found.r_hat < 1.05
+        assert torch.allclose(found.log_target.flatten(), standard(z @ inverse.mT))
+
+    def test_r_hat_of_chains_that_stay_where_they_are(self):
+        """Two wells that no move crosses, of which one is far deeper."""
+
+        def wells(z):
+            apart = torch.stack([30.0 + standard(z - 20.0), standard(z + 20.0)])
+            return torch.logsumexp(apart, 0)
+
+        begin = torch.cat([normal(10, 2) + 20.0, normal(10, 2) - 20.0])
+        found = chains_from(begin, Known(wells), torch.eye(2).double(), burnt=5, kept=20, seed=0)
+        assert found.r_hat > 5.0
+
+
+def test_what_few_particles_say_of_a_covariance_counts_little():
+    """With as many as dimensions half of it is that of the base, or only its variances are."""
+    d = 6
+    base = torch.linalg.cholesky(0.98 * torch.ones(d, d).double() + 0.02 * torch.eye(d).double())
+    exact = base @ base.mT
+    z = normal(12, d) @ base.mT
+    weight = torch.full((12,), 1.0 / 12, dtype=torch.float64)
+
+    def off(root):
+        whitened = torch.linalg.solve_triangular(root, base, upper=False)
+        return float(torch.linalg.svdvals(whitened).log().abs().max())
+
+    assert off(root_of(z, weight, base)) < 0.8 < off(root_of(z, weight))
+    many = normal(20_000, d) @ base.mT
+    even = torch.full((20_000,), 1.0 / 20_000, dtype=torch.float64)
+    for root in (root_of(many, even, torch.eye(d).double()), root_of(many, even)):
+        np.testing.assert_allclose(root @ root.mT, exact, atol=0.05 * float(exact.abs().max()))

@@ -86,8 +86,9 @@ def test_hessian_and_bounded_root_of_a_normal():
 
 
 def test_bounded_root_bounds_flat_directions():
+    """And takes upward curvature for downward curvature (tests/inference/test_descent.py)."""
     root = bounded_root(np.diag([4.0, 0.0, -1.0]))
-    np.testing.assert_allclose(np.diag(root @ root.T), [0.25, 2.25, 2.25])
+    np.testing.assert_allclose(np.diag(root @ root.T), [0.25, 2.25, 1.0])
 
 
 def test_out_of_range_is_a_wall_not_a_crash(potential):

@@ -9,6 +9,7 @@ from scipy.optimize import rosen, rosen_der, rosen_hess
 from pyro_dynogp.inference.optimise.descent import (
     FLAT,
     LEAST,
+    WIDEST,
     bounded_root,
     descend,
     hessian,
@@ -104,6 +105,15 @@ def test_bounded_root_of_a_definite_hessian_is_that_of_its_inverse():
     root = bounded_root(H)
     np.testing.assert_allclose(root @ root.T, np.linalg.inv(H), rtol=1e-9)
     np.testing.assert_array_equal(root, np.tril(root))
+
+
+def test_bounded_root_where_a_density_is_flat_or_curves_upwards():
+    """Upward curvature says how far the density is what it is here, as downward curvature does."""
+    axes = np.linalg.qr(np.random.default_rng(0).standard_normal((4, 4)))[0]
+    curvature = np.array([25.0, -25.0, 0.01, -0.01])
+    root = bounded_root((axes * curvature) @ axes.T)
+    sds = np.sqrt(np.diag(axes.T @ root @ root.T @ axes))
+    np.testing.assert_allclose(sds, [0.2, 0.2, WIDEST, WIDEST], rtol=1e-9)
 
 
 def test_newton_finds_the_minima_of_a_double_well_to_rounding():

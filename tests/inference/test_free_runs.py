@@ -11,7 +11,7 @@ import pyro_dynogp as dgp
 from pyro_dynogp.inference import free_runs
 from pyro_dynogp.inference.free_runs import free_run_error, noise_pays
 from pyro_dynogp.inference.methods import mode
-from pyro_dynogp.inference.optimise.maximum import Optimum
+from pyro_dynogp.inference.optimise.optimum import Optimum
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.plans import starting_points
 from pyro_dynogp.models.outputs import output_process

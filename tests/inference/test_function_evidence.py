@@ -23,7 +23,8 @@ from pyro_dynogp.inference.function_evidence import (
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.mode import at_optimum
 from pyro_dynogp.inference.optimise.gauss_newton import Innovations
-from pyro_dynogp.inference.optimise.maximum import Optimum, maximise
+from pyro_dynogp.inference.optimise.maximum import maximise
+from pyro_dynogp.inference.optimise.optimum import Optimum
 from pyro_dynogp.inference.refit import refit
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.plans import starting_points

@@ -12,7 +12,7 @@ import torch
 import pyro_dynogp as dgp
 from pyro_dynogp.inference.density import Potential, spread
 from pyro_dynogp.inference.methods.optima import LEAST_WEIGHT, MOST_OPTIMA, _weighted
-from pyro_dynogp.inference.optimise.maximum import Optimum
+from pyro_dynogp.inference.optimise.optimum import Optimum
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.run import Run
 from tests.inference.cascades import FAST, wiener

@@ -19,7 +19,9 @@ def fitted():
     record = dgp.Record(time=np.arange(120.0), inputs=u, outputs=y)
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        fit = dgp.fit(dgp.Wiener(1, pairs=1), record, restarts=2, workers=1, progress=False)
+        fit = dgp.fit(
+            dgp.Wiener(1, pairs=1), record, restarts=2, workers=1, progress=False, method="svi"
+        )
     return fit, Problem(fit.model, fit.model.prepare(fit.records)), [str(w.message) for w in said]
 
 

@@ -111,7 +111,7 @@ def rubbed(n, seed, noise=0.02):
 
 
 def test_friction_acts_on_a_velocity_that_nothing_measures(tmp_path):
-    """With a hidden signal less than twice the noise; with a function of the position far from it."""
+    """With a hidden signal within twice the noise; with a function of the position far off."""
     record, truth, sd = rubbed(700, 0)
     train, later = record[:500], record[500:]
     options = {"method": "map", "workers": 1, "progress": False, "seed": 0}

