@@ -1,7 +1,6 @@
 """Simulated plants with feedback: free runs beside those of the true plant.
 
-Three models each: a linear one, the feedback of its structure with defaults, and with what `chosen`
-says.
+Two models each: a linear one, and the feedback of its structure, both with defaults.
 
 Duffing oscillators, tank chains (every second one overflows), friction and Bouc-Wen hysteresis,
 from `pyro_dynogp.examples.feedback`: 600 samples are fitted, 400 forecast from their inputs alone.
@@ -23,12 +22,10 @@ import time
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import torch
-from gpytorch.kernels import RBFKernel
 
 import pyro_dynogp as dgp
 from pyro_dynogp.examples.feedback import (
@@ -43,8 +40,8 @@ from tests.benchmarks.markdown import table
 
 NOISE = (0.01, 0.02, 0.05)
 Simulator = Callable[[int, float], FeedbackSimulation]
-Maker = Callable[..., dgp.Model]
-LINEAR, DEFAULTS, CHOSEN = "linear", "feedback", "feedback, chosen"
+Maker = Callable[[], dgp.Model]
+LINEAR, FEEDBACK = "linear", "feedback"
 
 
 def tanks(seed: int, noise: float) -> FeedbackSimulation:
@@ -56,30 +53,18 @@ def tanks(seed: int, noise: float) -> FeedbackSimulation:
 KINDS: Mapping[str, tuple[Simulator, Maker]] = {
     "Duffing": (
         lambda seed, noise: simulate_duffing(seed, noise_ratio=noise),
-        lambda **more: dgp.NonlinearFeedback(1, **more),
+        lambda: dgp.NonlinearFeedback(1),
     ),
-    "tanks": (tanks, lambda **more: dgp.NonlinearFeedback(1, hidden=1, **more)),
+    "tanks": (tanks, lambda: dgp.NonlinearFeedback(1, hidden=1)),
     "friction": (
         lambda seed, noise: simulate_friction(seed, noise_ratio=noise),
-        lambda **more: dgp.NonlinearFeedback(1, hidden=1, **more),
+        lambda: dgp.NonlinearFeedback(1, hidden=1),
     ),
     "Bouc-Wen": (
         lambda seed, noise: simulate_bouc_wen(seed, noise_ratio=noise),
-        lambda **more: dgp.NonlinearFeedback(1, pairs=2, hidden=1, **more),
+        lambda: dgp.NonlinearFeedback(1, pairs=2, hidden=1),
     ),
 }
-
-
-def chosen(kind: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Options of model and fit beside the defaults.
-
-    The kernel did better on seeds 0 and 2 of the spring: between its inducing values a rougher
-    function is uncertain, and free runs draw from that. Gauss-Newton did better on seed 0 of the
-    tanks, where the default climb ends far below the top.
-    """
-    if kind == "Duffing":
-        return {"kernel": RBFKernel()}, {}
-    return {}, {"optimizer": "gauss-newton", "steps": 100}
 
 
 def noise_of(seed: int) -> float:
@@ -103,12 +88,11 @@ def one(kind: str, seed: int, which: str) -> dict[str, object]:
     """One fit and its scores."""
     simulate, make = KINDS[kind]
     plant = simulate(seed, noise_of(seed))
-    more, options = chosen(kind) if which == CHOSEN else ({}, {})
-    model = dgp.LinearDynamicGP(1, pairs=2) if which == LINEAR else make(**more)
+    model = dgp.LinearDynamicGP(1, pairs=2) if which == LINEAR else make()
     begin = time.process_time()
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always", UserWarning)
-        fit = dgp.fit(model, plant.train, workers=1, progress=False, seed=0, **options)
+        fit = dgp.fit(model, plant.train, workers=1, progress=False, seed=0)
         seconds = time.process_time() - begin
         found = relative(fit, plant)
     return {
@@ -153,7 +137,7 @@ def run(folder: Path) -> str:
     there = {(r["kind"], r["seed"], r["model"]) for r in found}
     for seed in seeds():
         for kind in kinds:
-            for which in (LINEAR, DEFAULTS, CHOSEN):
+            for which in (LINEAR, FEEDBACK):
                 if (kind, seed, which) not in there:
                     found.append(one(kind, seed, which))
                     pd.DataFrame(found).to_csv(path, index=False)
@@ -162,7 +146,7 @@ def run(folder: Path) -> str:
     lines = [
         row(kind, which, own)
         for kind in kinds
-        for which in (CHOSEN, DEFAULTS, LINEAR)
+        for which in (FEEDBACK, LINEAR)
         if len(own := frame[(frame["kind"] == kind) & (frame["model"] == which)])
     ]
     head = [
