@@ -64,6 +64,8 @@ def kernels_by_evidence(
 
     Joint densities under different kernels do not compare.
     """
+    if not kernel_sites(model):  # functions that are known
+        return list(optima)
     leading = [
         with_kernels_by_evidence(model, records, one, run, f"kernels-{index}")
         for index, one in enumerate(optima[:CONSIDERED])
@@ -84,15 +86,13 @@ def with_kernels_by_evidence(
     """An optimum with kernels of the highest evidence, and all else at its mode given them.
 
     Args:
-        model: collapsed. records: of it. optimum: to begin at.
+        model: collapsed, with functions. records: of it. optimum: to begin at.
         run: how. key: of checkpoints. rounds: most of them.
 
     Returns:
         The optimum, or the given one where no round raises the evidence.
     """
     names = kernel_sites(model)
-    if not names:
-        return optimum
     optimizer = "gauss-newton" if has_innovations(model) else optimizer_near(model)
     here = _Expansion.at(model, records, optimum.values)
     for number in range(rounds):

@@ -18,6 +18,7 @@ from pyro_dynogp.inference.function_evidence import (
     _Expansion,
     functions_of,
     kernel_sites,
+    kernels_by_evidence,
     with_kernels_by_evidence,
 )
 from pyro_dynogp.inference.methods.base import Problem
@@ -235,10 +236,24 @@ def test_a_round_that_lowers_the_evidence_is_not_taken(rounds, monkeypatch):
     assert kept is found
 
 
-def test_models_without_functions_stay():
-    problem = Problem.of(dgp.LinearDynamicGP(1, pairs=1), PLANT.train[:100])
-    one = Optimum(0.0, {}, np.zeros(1), "")
-    assert with_kernels_by_evidence(problem.target, problem.records, one, ALONE, "none") is one
+def test_optima_of_known_functions_stay():
+    known = dgp.Known(lambda y: y**3, range=(-3.0, 3.0))
+    model = dgp.Cascade(1, (dgp.Dynamic(feedback=("f",)), known), output="g")
+    problem = Problem.of(model, PLANT.train[:100])
+    optima = [Optimum(energy, {}, np.zeros(1), "") for energy in (0.0, 1.0, 2.0)]
+    assert kernels_by_evidence(problem.target, problem.records, optima, ALONE) == optima
+
+
+def test_the_evidence_chooses_among_two_optima(rounds, monkeypatch):
+    """The more probable one under its own kernel is not the one with more evidence."""
+    problem, joint, found = rounds
+    monkeypatch.setattr(
+        function_evidence, "with_kernels_by_evidence", lambda model, records, one, *_: one
+    )
+    assert joint.energy < found.energy
+    for optima in ([joint, found], [found, joint], [joint, found, joint]):
+        best = kernels_by_evidence(problem.target, problem.records, optima, ALONE)
+        assert best == [found]
 
 
 def test_free_runs_of_a_default_fit_keep_to_the_spring():
