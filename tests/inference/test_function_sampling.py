@@ -19,7 +19,10 @@ from pyro_dynogp.inference.function_sampling import (
     shares,
 )
 from pyro_dynogp.inference.log_joint import log_joint_of
+from pyro_dynogp.inference.methods import importance
 from pyro_dynogp.inference.methods.annealed import Annealed, Joint
+from pyro_dynogp.inference.methods.base import Problem
+from pyro_dynogp.inference.run import Run
 from tests.inference.cascades import wiener, wiener_record
 
 QUICK = {"restarts": 1, "workers": 1, "progress": False}
@@ -154,3 +157,36 @@ def test_bands_hold_where_those_of_functions_alone_do_not():
             crps[method].append(found["crps"])
     assert np.mean(shares_of["importance"]) > 0.8 > np.mean(shares_of["svi"])
     assert np.mean(crps["importance"]) < 0.9 * np.mean(crps["svi"])
+
+
+@pytest.mark.parametrize(
+    ("make", "samples", "longest", "drawn"),
+    [
+        (dgp.NonlinearFeedback, 150, None, True),
+        (dgp.NonlinearFeedback, 151, None, False),
+        (dgp.NonlinearFeedback, 151, 151, True),
+        (dgp.Wiener, 1000, None, True),
+        (dgp.Wiener, 1001, None, False),
+        (dgp.Wiener, 60, 59, False),
+    ],
+)
+def test_how_long_records_may_be_for_draws_of_all_parameters(
+    monkeypatch, make, samples, longest, drawn
+):
+    """With feedback fewer samples: normals around kernels by the evidence do as well there."""
+
+    class ChosenError(Exception):
+        pass
+
+    def choose(name):
+        def stop(*args, **options):
+            raise ChosenError(name)
+
+        return stop
+
+    monkeypatch.setattr(importance, "sample_functions", choose("draws"))
+    monkeypatch.setattr(importance.Normal, "around", choose("normals"))
+    u = np.random.default_rng(0).standard_normal(samples)
+    problem = Problem.of(make(1, pairs=1), dgp.Record(time=np.arange(samples), inputs=u, outputs=u))
+    with pytest.raises(ChosenError, match="draws" if drawn else "normals"):
+        importance.with_draws_around(problem, [], Run(0, workers=1), 10, longest)

@@ -33,8 +33,8 @@ def method_of(
 
     Args:
         method: "importance", "map", "svi", "nuts", an object, or None for what suits the model:
-            "svi" with a guide, with feedback, and of models with static layers with an option that
-            `Importance` does not have, else "importance".
+            "svi" with a guide, and of models with static layers with an option that `Importance`
+            does not have, else "importance".
         model: that is to be fitted.
         options: of the method by name; None as a value is an option that is not given, and so is
             ``guide="collapsed"``.
@@ -66,9 +66,7 @@ def method_of(
         return method
     if method is None:
         of_svi = set(_options(Normal)) - set(_options(Importance))
-        # With feedback kernels by the evidence and normals around them do as well, in a third of
-        # the time (docs/measurements.md).
-        named = model.has_function and (model.has_feedback or not of_svi.isdisjoint(given))
+        named = model.has_function and not of_svi.isdisjoint(given)
         method = "svi" if "guide" in given or named else "importance"
     if method not in CLASSES:
         raise invalid("method", expected="'importance', 'map', 'svi' or 'nuts'", got=repr(method))

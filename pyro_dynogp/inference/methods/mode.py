@@ -93,6 +93,9 @@ def _faint(values: Values) -> Values:
 class Mode:
     """The posterior mode: the best optimum of several starts.
 
+    With feedback kernels and output scales of functions are those of the highest evidence, and all
+    else is at its mode given them, see `function_evidence`.
+
     Attributes:
         optimizer: "gauss-newton" (under Gaussian noise), "lbfgs",
             "preconditioned" (L-BFGS in coordinates that Hessians make round, which gets to the top
