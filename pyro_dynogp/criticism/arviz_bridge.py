@@ -68,6 +68,10 @@ def _elpd_class() -> Any:
     """ArviZ's ELPDData, whose text also says what the draws are of, and the notes."""
 
     class Elpd(_arviz().stats.stats_utils.ELPDData):  # type: ignore[misc]
+        def copy(self, deep: bool = True) -> Any:
+            """A copy of the same kind: ArviZ's own is of its class."""
+            return Elpd(super().copy(deep))
+
         def __str__(self) -> str:
             lines = [super().__str__()]
             if "drawn" in self:

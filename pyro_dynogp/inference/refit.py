@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from types import MappingProxyType
 from typing import TypeVar
 
 import torch
@@ -18,7 +17,7 @@ from pyro_dynogp.inference.methods.mode import at_optimum, climb, louder, most_p
 from pyro_dynogp.inference.methods.nuts import sample_posterior
 from pyro_dynogp.inference.methods.optima import POLISH, Hyperparameters, posterior_of
 from pyro_dynogp.inference.methods.svi import Schedule
-from pyro_dynogp.inference.optimise.maximum import Effort, maximise, optimizer_for, optimizer_near
+from pyro_dynogp.inference.optimise.maximum import Effort, maximise, optimizer_near
 from pyro_dynogp.inference.optimise.optimum import Optimum
 from pyro_dynogp.inference.posteriors import Mixture, Sampled, draws_of_guide
 from pyro_dynogp.inference.run import Run
@@ -38,7 +37,7 @@ from pyro_dynogp.support.parallel import seeded
 SAME_STEPS, ADAM_STEPS, SVI_STEPS = 300, 200, 400
 # Iterations of extended models: linear, others of the same layers, with a layer more.
 LINEAR_STEPS, LAYERED_STEPS = 100, 100
-ADDED_STEPS: Mapping[str, int] = MappingProxyType({"gauss-newton": 40, "lbfgs": 300, "adam": 300})
+ADDED_STEPS = 300
 # Starts from linear fits of its own that a model with a layer more has beside what is learnt, and
 # iterations of those fits.
 FRESH, FRESH_STEPS = 4, 40
@@ -178,8 +177,9 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
 
     With a layer more Adam climbs, as in a first fit: better optimisers get to modes of a free
     function that fit the noise (one that is flat where outputs repeat) and of which its special
-    cases have none, so that gains would be those of climbs. With feedback they climb, and kernels
-    are then those of the highest evidence. Where the function
+    cases have none, so that gains would be those of climbs. With feedback L-BFGS climbs, which
+    starts near the line (by Gauss-Newton a friction that was added forecast worse), and kernels are
+    then those of the highest evidence. Where the function
     is far from a line (a sensor that reports a size) the linear fit is any of several poor optima:
     such a model starts from linear fits of its own, too; a function in feedback from what is
     learnt, where nothing comes back as yet.
@@ -209,9 +209,9 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     if len(target.layers) > len(fit.model.layers):
         if not (run.steps or (target.has_feedback and fit.model.is_linear)):
             starts += starting_points(target, records, run, count=FRESH, steps=FRESH_STEPS)
-        optimizer = optimizer_for(target)
-        optima = climb(target, records, starts, [], run, steps=run.steps or ADDED_STEPS[optimizer],
-                       optimizer=optimizer, effort=EXTENDED)  # fmt: skip
+        optima = climb(target, records, starts, [], run, steps=run.steps or ADDED_STEPS,
+                       optimizer="lbfgs" if target.has_feedback else "adam",
+                       effort=EXTENDED)  # fmt: skip
         return _settled(problem, optima, run)
     if run.steps:  # a few, to compare variants
         starts = [most_probable(problem, starts)]

@@ -148,7 +148,7 @@ def test_a_loop_whose_worker_is_killed_reports_the_same():
         until = time.monotonic() + 120.0
         before = dict.fromkeys(pid for _, pid in children())
         while not killed and time.monotonic() < until:
-            busy = [pid for ticks, pid in children() if ticks > 300 and pid not in before]
+            busy = [pid for ticks, pid in children() if ticks > 150 and pid not in before]
             if busy:
                 os.kill(busy[0], signal.SIGKILL)
                 killed.append(busy[0])
