@@ -337,9 +337,13 @@ def test_draws_where_a_normal_will_not_do(short):
     found = draws_of(fit, count=200)
     assert found.kind.startswith("annealed from Student-t around the mode and from the prior; ")
     assert found.log_q is None
-    # -log p over draws of a d-dimensional posterior spreads by about sqrt(d/2), d = 17.
-    assert 1.5 < np.std(found.log_p) < 6.0
-    assert np.std(own.log_p) > 2.0 * np.std(found.log_p)
+    # -log p over draws of a d-dimensional posterior spreads by about sqrt(d/2), d = 17. Quartiles,
+    # as these draws descend from some 20 particles, of which one may lie far out.
+    own_spread, spread = (
+        np.subtract(*np.percentile(one.log_p, [75, 25])) / 1.35 for one in (own, found)
+    )
+    assert 1.5 < spread < 6.0
+    assert own_spread > 2.0 * spread
 
 
 def test_the_mode_of_a_cascade_is_no_posterior(bent, monkeypatch):
