@@ -280,7 +280,7 @@ def test_good_k_grows_with_the_draws():
 def test_options():
     with pytest.raises(ValueError, match="draws: expected a whole number >= 1"):
         dgp.Importance(draws=0)
-    assert dataclasses.astuple(dgp.Importance()) == (300, 1000, None)
+    assert dataclasses.astuple(dgp.Importance()) == (300, None, None)
 
 
 def test_where_annealing_gets_nowhere(fit, monkeypatch):

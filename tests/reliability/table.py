@@ -191,7 +191,7 @@ TABLE: dict[str, Entry] = {
     "TimeScale": plain(dgp.TimeScale, {"step": (*POSITIVE, None), "duration": (*POSITIVE, None)},
                        step=1.0, duration=100.0),
     "Mode": plain(dgp.Mode, {"optimizer": NAME}),
-    "Importance": plain(dgp.Importance, {"draws": (*COUNT, None), "longest": (*COUNT, None),
+    "Importance": plain(dgp.Importance, {"draws": (*COUNT, None), "longest": COUNT,
                                          "optimizer": NAME}),
     "Normal": plain(dgp.Normal, {"family": (*NAME, None), **VARIATIONAL, "optimizer": NAME}),
     "Nuts": plain(dgp.Nuts, {"chains": COUNT, "warmup": COUNT, "draws": (*COUNT, 3),
