@@ -67,7 +67,7 @@ def _elpd(entries: Mapping[str, Any]) -> Any:
 def _elpd_class() -> Any:
     """ArviZ's ELPDData, whose text also says what the draws are of, and the notes."""
 
-    class Elpd(_arviz().stats.stats_utils.ELPDData):  # type: ignore[misc]
+    class Elpd(_arviz().stats.stats_utils.ELPDData):  # type: ignore[misc]  # ArviZ has no types
         def copy(self, deep: bool = True) -> Any:
             """A copy of the same kind: ArviZ's own is of its class."""
             return Elpd(super().copy(deep))

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pyro_dynogp.criticism.finding import apart
 from pyro_dynogp.inference.cascade_coordinates import StraightPotential
-from pyro_dynogp.inference.density import Potential, within_edges
+from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.importance_sampling import sample_around, samples_of, systematic
 from pyro_dynogp.inference.log_joint import log_joint_of
 from pyro_dynogp.inference.methods.annealed import Joint, anneal
@@ -145,30 +145,22 @@ def carried(
     after: Potential
     if model.has_function:
         before, after = (Potential(model, (_data(fit),), old.mode) for fit in (old, new))
-        z = _packed(before, draws.values)
     else:
         straight = StraightPotential(model, (_data(old),), old.mode)
         before, after = straight, straight.on((_data(new),))
-        z = straight.pack(draws.values)
     start, target = (
         Joint(potential, samples_of(_data(fit))) for potential, fit in ((before, old), (after, new))
     )
     count = len(draws)
     shift = float(np.random.default_rng(seed).random())
     first = systematic(np.exp(psis(draws.log_ratio)[0]), count, shift)
-    found = anneal(z[first], start, target, seed=seed, progress=progress)
+    z = before.pack(draws.values)[first]
+    found = anneal(z, start, target, seed=seed, progress=progress)
     with torch.no_grad():
         values = FrozenMapping(after.unpack(found.z))
     roots = np.arange(count) if draws.ancestor is None else draws.ancestor
     kind, group = "annealed from draws given other data", np.zeros(count, dtype=int)
     return PosteriorDraws(values, None, None, group, kind, roots[first[found.ancestor]])
-
-
-def _packed(potential: Potential, values: Values) -> Tensor:
-    """Unconstrained vectors (S, d) of draws."""
-    count = len(next(iter(values.values())))
-    parts = [site.transform.inv(values[site.name]).reshape(count, -1) for site in potential.sites]
-    return within_edges(torch.cat(parts, -1))
 
 
 def log_joint(fit: Fitted, values: Values) -> np.ndarray:

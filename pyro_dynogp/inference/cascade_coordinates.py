@@ -35,7 +35,7 @@ from pyro_dynogp.inference.cascade_coordinate_steps import (
     Step,
     affine,
 )
-from pyro_dynogp.inference.density import Potential, Site, parts, within_edges
+from pyro_dynogp.inference.density import Potential, Site, parts
 from pyro_dynogp.layers.functions import StaticFunction
 from pyro_dynogp.layers.sites import Arguments, Program
 from pyro_dynogp.models.model import Model
@@ -62,13 +62,12 @@ class StraightPotential(Potential):
 
     def pack(self, values: Mapping[str, Tensor]) -> Tensor:
         """Constrained values (*s, *shape) of every site to coordinates (*s, d)."""
-        first = self.sites[0]
-        lead = values[first.name].shape[: values[first.name].dim() - len(first.shape)]
-        inverse = [site.transform.inv(values[site.name]).reshape(*lead, -1) for site in self.sites]
-        z = by_name(self.sites, within_edges(torch.cat(inverse, -1)))
+        plain = super().pack(values)
+        z = by_name(self.sites, plain)
         with torch.no_grad():
             for step in reversed(self.steps):
                 step.backward(z)
+        lead = plain.shape[:-1]
         return torch.cat([z[site.name].reshape(*lead, -1) for site in self.sites], -1)
 
     def unpack(self, x: Tensor) -> dict[str, Tensor]:

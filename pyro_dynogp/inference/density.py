@@ -171,9 +171,9 @@ class Potential:
 
     def places(self, names: Sequence[str]) -> np.ndarray:
         """Entries of the unconstrained vector that belong to some sites, in the vector's order."""
-        sizes = [site.unconstrained.numel() for site in self.sites]
-        owners = np.repeat([site.name for site in self.sites], sizes)
-        return np.flatnonzero(np.isin(owners, list(names)))
+        every = parts(self.sites, torch.arange(self.size))
+        own = [place.reshape(-1).numpy() for site, place in every if site.name in names]
+        return np.concatenate([np.empty(0, dtype=int), *own])
 
     @property
     def hessian_cost(self) -> int:
@@ -181,12 +181,14 @@ class Potential:
         return -(-self.size // self.width)
 
     def pack(self, values: Mapping[str, Tensor]) -> Tensor:
-        """Constrained values of every site to the unconstrained vector (d,), finite.
+        """Constrained values (*s, *shape) of every site to unconstrained vectors (*s, d), finite.
 
         A mode may lie on a boundary to the last digit, where the vector would be infinite.
         """
-        parts = [site.transform.inv(values[site.name]).reshape(-1) for site in self.sites]
-        return within_edges(torch.cat(parts))
+        first = self.sites[0]
+        lead = values[first.name].shape[: values[first.name].dim() - len(first.shape)]
+        parts = [site.transform.inv(values[site.name]).reshape(*lead, -1) for site in self.sites]
+        return within_edges(torch.cat(parts, -1))
 
     def unpack(self, z: Tensor) -> dict[str, Tensor]:
         """Unconstrained vectors (*s, d) to constrained values (*s, *shape) of every site."""

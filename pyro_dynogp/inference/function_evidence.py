@@ -70,9 +70,7 @@ def kernels_by_evidence(
         with_kernels_by_evidence(model, records, one, run, f"kernels-{index}")
         for index, one in enumerate(optima[:CONSIDERED])
     ]
-    if len(leading) == 1:
-        return leading
-    return [min(leading, key=lambda one: _Expansion.at(model, records, one.values).energy)]
+    return [min(leading, key=lambda one: one[1])[0]]
 
 
 def with_kernels_by_evidence(
@@ -82,7 +80,7 @@ def with_kernels_by_evidence(
     run: Run,
     key: str,
     rounds: int = ROUNDS,
-) -> Optimum:
+) -> tuple[Optimum, float]:
     """An optimum with kernels of the highest evidence, and all else at its mode given them.
 
     Args:
@@ -90,7 +88,8 @@ def with_kernels_by_evidence(
         run: how. key: of checkpoints. rounds: most of them.
 
     Returns:
-        The optimum, or the given one where no round raises the evidence.
+        The optimum, or the given one where no round raises the evidence; and its -log density
+        without the functions' values [nats].
     """
     names = kernel_sites(model)
     optimizer = "gauss-newton" if has_innovations(model) else optimizer_near(model)
@@ -109,7 +108,7 @@ def with_kernels_by_evidence(
         here = there
         history = np.concatenate([optimum.history, found.history])
         optimum = replace(found, history=history, message=optimum.message)
-    return optimum
+    return optimum, here.energy
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,9 +196,7 @@ class _Expansion:
             off = A @ m - v0
             found = self.gradient @ off - 0.5 * (off @ self.fisher @ off + m @ m)
             found = found - root.diagonal().log().sum()
-            return found + sum(
-                prior[n].log_prob(values[n]).sum() for n in kernel_sites(self.model)
-            ), m
+            return found + sum(prior[n].log_prob(values[n]).sum() for n in names), m
 
         def objective(theta: np.ndarray) -> tuple[float, np.ndarray]:
             x = torch.tensor(theta, requires_grad=True)

@@ -42,11 +42,8 @@ class PairOrder:
         if potential.linear is None or not isinstance(density, Direct):
             return None
         ((wire, _),) = density.model.dynamic
-        place, places = 0, {}
-        for site in potential.sites:
-            places[site.name] = np.arange(place, place + site.unconstrained.numel())
-            place += site.unconstrained.numel()
-        poles = np.stack([places[f"{wire.name}_log_{x}"] for x in ("decay", "frequency")])
+        names = (f"{wire.name}_log_{x}" for x in ("decay", "frequency"))
+        poles = np.stack([potential.places([name]) for name in names])
         pair = wire.dims["pair"]
         axes = {site.name: site.dims.index(pair) for site in density.sites if pair in site.dims}
         return cls(poles, axes, centre[poles].T)

@@ -17,7 +17,12 @@ from pyro_dynogp.inference.methods.mode import at_optimum, climb, louder, most_p
 from pyro_dynogp.inference.methods.nuts import sample_posterior
 from pyro_dynogp.inference.methods.optima import POLISH, Hyperparameters, posterior_of
 from pyro_dynogp.inference.methods.svi import Schedule
-from pyro_dynogp.inference.optimise.maximum import Effort, maximise, optimizer_near
+from pyro_dynogp.inference.optimise.maximum import (
+    Effort,
+    maximise,
+    optimizer_by_gradients,
+    optimizer_near,
+)
 from pyro_dynogp.inference.optimise.optimum import Optimum
 from pyro_dynogp.inference.posteriors import Mixture, Sampled, draws_of_guide
 from pyro_dynogp.inference.run import Run
@@ -36,8 +41,7 @@ from pyro_dynogp.support.parallel import seeded
 # Iterations from the old optima, and of Adam and SVI where they are of a model with functions.
 SAME_STEPS, ADAM_STEPS, SVI_STEPS = 300, 200, 400
 # Iterations of extended models: linear, others of the same layers, with a layer more.
-LINEAR_STEPS, LAYERED_STEPS = 100, 100
-ADDED_STEPS = 300
+LINEAR_STEPS, LAYERED_STEPS, ADDED_STEPS = 100, 100, 300
 # Starts from linear fits of its own that a model with a layer more has beside what is learnt, and
 # iterations of those fits.
 FRESH, FRESH_STEPS = 4, 40
@@ -154,15 +158,20 @@ def _again(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
 
     Better optimisers leave an optimum of a model with functions along its ridges.
     """
-    feedback = fit.model.has_feedback
-    adam = fit.model.has_function and fit.method != "map" and not feedback
+    model = problem.target
+    adam = model.has_function and fit.method != "map" and not model.has_feedback
     steps = run.steps or (ADAM_STEPS if adam else SAME_STEPS)
-    optimizer = "adam" if adam else optimizer_near(fit.model)
+    optimizer = "adam" if adam else optimizer_near(model)
     optima = maximise(
-        problem.target, problem.records, optima_of(fit), run, optimizer=optimizer, steps=steps,
-        effort=AGAIN, held=kernel_sites(problem.target) if feedback else (),
+        model, problem.records, optima_of(fit), run, optimizer=optimizer, steps=steps,
+        effort=AGAIN, held=_held(model),
     )  # fmt: skip
     return _settled(problem, optima, run)
+
+
+def _held(model: Model) -> tuple[str, ...]:
+    """Sites that keep what is learnt while all else climbs, see `_settled`."""
+    return kernel_sites(model) if model.has_feedback else ()
 
 
 def _settled(problem: Problem, optima: list[Optimum], run: Run) -> list[Optimum]:
@@ -179,10 +188,9 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     function that fit the noise (one that is flat where outputs repeat) and of which its special
     cases have none, so that gains would be those of climbs. With feedback L-BFGS climbs, which
     starts near the line (by Gauss-Newton a friction that was added forecast worse), and kernels are
-    then those of the highest evidence. Where the function
-    is far from a line (a sensor that reports a size) the linear fit is any of several poor optima:
-    such a model starts from linear fits of its own, too; a function in feedback from what is
-    learnt, where nothing comes back as yet.
+    then those of the highest evidence. Where the function is far from a line (a sensor that reports
+    a size) the linear fit is any of several poor optima: such a model starts from linear fits of
+    its own, too; a function in feedback from what is learnt, where nothing comes back as yet.
 
     A linear model with more poles has the starts of a first fit, too: what is new may take the
     place of what is learnt.
@@ -196,7 +204,7 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     def climbed(model: Model, points: Sequence[Values], usual: int) -> list[Optimum]:
         return maximise(
             model, records, points, run, optimizer=optimizer_near(model), steps=run.steps or usual,
-            effort=EXTENDED, held=kernel_sites(model) if model.has_feedback else (),
+            effort=EXTENDED, held=_held(model),
         )  # fmt: skip
 
     if target.is_linear:
@@ -210,8 +218,7 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
         if not (run.steps or (target.has_feedback and fit.model.is_linear)):
             starts += starting_points(target, records, run, count=FRESH, steps=FRESH_STEPS)
         optima = climb(target, records, starts, [], run, steps=run.steps or ADDED_STEPS,
-                       optimizer="lbfgs" if target.has_feedback else "adam",
-                       effort=EXTENDED)  # fmt: skip
+                       optimizer=optimizer_by_gradients(target), effort=EXTENDED)  # fmt: skip
         return _settled(problem, optima, run)
     if run.steps:  # a few, to compare variants
         starts = [most_probable(problem, starts)]

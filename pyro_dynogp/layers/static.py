@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.layers.functions import JITTER, StaticFunction, even_grid
-from pyro_dynogp.layers.kernels import KernelPrior
+from pyro_dynogp.layers.kernels import ROUGH, KernelPrior
 from pyro_dynogp.layers.sites import Site, Values, normal, sample
 from pyro_dynogp.support.errors import COUNT, checked, invalid, verify, verify_fields
 from pyro_dynogp.support.tensors import as_tensor
@@ -87,7 +87,7 @@ class StaticPrior:
     mean: MeanName = "constant"
     learn_locations: bool = True
     locations: Any = None
-    smoothness: float = 1.5
+    smoothness: float = ROUGH
 
     def __post_init__(self) -> None:
         verify_fields(self)

@@ -11,6 +11,7 @@ import torch
 from gpytorch.kernels import Kernel
 from torch import Tensor
 
+from pyro_dynogp.layers.kernels import ROUGH
 from pyro_dynogp.lti.modes import NoiseStructure
 from pyro_dynogp.support.errors import invalid
 
@@ -106,7 +107,7 @@ class Static:
     learn_locations: bool = True
     support: int = 64
     name: str | None = None
-    smoothness: float = 1.5
+    smoothness: float = ROUGH
 
 
 @dataclass(frozen=True)

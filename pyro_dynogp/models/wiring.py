@@ -253,9 +253,8 @@ def _check_layer(name: str, layer: Layer) -> None:
             RULES[option.name].check(f"{option.name} of layer {name!r}", value)
     if isinstance(layer, Static):
         COUNT.check(f"support of layer {name!r}", layer.support)
-        KernelPrior(
-            name, layer.kernel, 1, layer.smoothness
-        )  # refuses what is no kernel of one function
+        # Refuses what is no kernel of one function.
+        KernelPrior(name, layer.kernel, 1, layer.smoothness)
     elif isinstance(layer, Known):
         _check_known(name, layer)
 

@@ -82,7 +82,7 @@ def run(folder: Path) -> str:
         "|---" * 11 + "|",
     ]
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+        warnings.simplefilter("ignore")  # of high k: the table has what it comes to
         for name, fit in fits(n).items():
             begin = time.process_time()
             hook = dgp.loo(fit, target="missing sample", **QUIET)

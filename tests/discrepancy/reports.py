@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.result import Attempt, EffectTest, FoundEffect
@@ -163,3 +164,28 @@ def nothing(**changes):
         "model_after": GIVEN,
     }  # fmt: skip
     return report(**(same | changes))
+
+
+def with_names(name, input_unit="m", output_unit="m"):
+    """A report in which a name is everywhere where a file can put one."""
+    w = record(240)
+    stamps = pd.date_range("2024-03-30", periods=240, freq="1h", tz="Europe/Vienna")
+    named = Record(
+        stamps, w.inputs, w.outputs, input_names=["u" + name], output_names=[name],
+        input_units=[input_unit], output_units=[output_unit], extra={name + "c": w.outputs[:, 0]},
+        name=name,
+    )  # fmt: skip
+    known, sealed = named.split(180)
+    forecast = prediction(sealed)
+    found = effect(
+        name=name, sentence=name, block=name, parameters={name: (1.0, 0.1)}, ties=(name,),
+        experiment=name, curve=curve(x_label=name, y_label=name),
+    )  # fmt: skip
+    return report(
+        known=known, sealed=sealed, forecast_before=forecast, forecast_after=forecast,
+        effects=(found,), warnings=(name,), data=name, model_before=(Part(name, name),),
+        model_after=(Part(name, name), Part("long", name * 3)),
+        last_block_tests={name: (0.1, 0.2)}, seconds={name: 1.0},
+        attempts=(attempt(1, name, 0.01, "rejected", name),
+                  attempt(1, name, 0.1, "not tried", name)),
+    )  # fmt: skip

@@ -181,7 +181,7 @@ def rounds():
     )[0]
     return problem, best, with_kernels_by_evidence(
         problem.target, problem.records, best, ALONE, "kernels"
-    )  # fmt: skip
+    )[0]  # fmt: skip
 
 
 def test_the_spring_is_smooth(rounds):
@@ -208,7 +208,7 @@ def test_a_small_gain_ends_the_rounds(rounds, monkeypatch, gain, climbs):
 
     monkeypatch.setattr(_Expansion, "best", lambda self: (found.values, gain))
     monkeypatch.setattr(function_evidence, "maximise", climb)
-    kept = with_kernels_by_evidence(problem.target, problem.records, found, ALONE, "small")
+    kept, _ = with_kernels_by_evidence(problem.target, problem.records, found, ALONE, "small")
     assert kept is found
     assert len(count) == climbs
 
@@ -216,10 +216,11 @@ def test_a_small_gain_ends_the_rounds(rounds, monkeypatch, gain, climbs):
 def test_no_more_than_the_rounds_that_are_wanted(rounds):
     problem, joint, found = rounds
     (records,) = (problem.records,)
-    one = with_kernels_by_evidence(problem.target, records, joint, ALONE, "one", rounds=1)
+    one, energy = with_kernels_by_evidence(problem.target, records, joint, ALONE, "one", rounds=1)
     energies = [
         _Expansion.at(problem.target, records, x.values).energy for x in (joint, one, found)
     ]
+    assert energy == energies[1]
     assert energies[0] > energies[1] >= energies[2]
 
 
@@ -232,7 +233,7 @@ def test_a_round_that_lowers_the_evidence_is_not_taken(rounds, monkeypatch):
         return self.potential.unpack(torch.tensor(z)), 1.0
 
     monkeypatch.setattr(_Expansion, "best", worse)
-    kept = with_kernels_by_evidence(problem.target, problem.records, found, ALONE, "worse")
+    kept, _ = with_kernels_by_evidence(problem.target, problem.records, found, ALONE, "worse")
     assert kept is found
 
 
@@ -247,9 +248,11 @@ def test_optima_of_known_functions_stay():
 def test_the_evidence_chooses_among_two_optima(rounds, monkeypatch):
     """The more probable one under its own kernel is not the one with more evidence."""
     problem, joint, found = rounds
-    monkeypatch.setattr(
-        function_evidence, "with_kernels_by_evidence", lambda model, records, one, *_: one
-    )
+
+    def kept(model, records, one, *_):
+        return one, _Expansion.at(model, records, one.values).energy
+
+    monkeypatch.setattr(function_evidence, "with_kernels_by_evidence", kept)
     assert joint.energy < found.energy
     for optima in ([joint, found], [found, joint], [joint, found, joint]):
         best = kernels_by_evidence(problem.target, problem.records, optima, ALONE)

@@ -32,7 +32,7 @@ from gpytorch.priors import (
 from torch.distributions import constraints
 
 from pyro_dynogp.layers.hyperpriors import hyperprior
-from pyro_dynogp.layers.kernels import SampledKernel, sample_kernel
+from pyro_dynogp.layers.kernels import KernelPrior, SampledKernel, sample_kernel
 
 
 class TentKernel(Kernel):
@@ -220,6 +220,18 @@ def test_default_is_matern_32_with_a_lengthscale_for_each_channel(channels):
     assert torch.equal(ours.diagonal(x), torch.ones(2, 5, dtype=torch.float64))
     assert ours.radial[0] == "matern32"
     assert ours.radial_variance is None
+
+
+@pytest.mark.parametrize("nu", [0.5, 1.5, 2.5])
+def test_smoothness_of_the_default(nu):
+    prior = KernelPrior("f", None, 1, nu)
+    kernel = prior.sampled({"f_lengthscale": torch.tensor([0.7]).double()})
+    x = torch.linspace(-1.0, 1.0, 5).double().unsqueeze(-1)
+    exact = MaternKernel(nu).double()
+    exact.lengthscale = 0.7
+    torch.testing.assert_close(kernel(x, x), exact(x, x).to_dense().detach())
+    with pytest.raises(ValueError, match="smoothness: expected none with a kernel"):
+        KernelPrior("f", exact, 1, 0.5)
 
 
 def test_sites_are_named_after_the_parameters():

@@ -78,7 +78,7 @@ def called(name, world, **changed):
     entry = TABLE[name]
     good = {**entry.good(world), **changed}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
+        warnings.simplefilter("ignore", UserWarning)  # fits of few steps say that they are poor
         return entry.call(world)(**good)
 
 

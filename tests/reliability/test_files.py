@@ -108,7 +108,7 @@ def test_what_nobody_wrote_never_crashes(name, fits, tmp_path):
     for _ in range(60 if name in EARLY else 20):
         told = foreign(path, generator, other)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+            warnings.simplefilter("ignore")  # what a changed file warns of is no matter here
             assert outcome(other, fits[name]) in ("refused", "same", "another"), told
 
 
@@ -196,7 +196,7 @@ import json, resource, sys, warnings
 from pathlib import Path
 import pyro_dynogp as dgp
 
-warnings.simplefilter("ignore")
+warnings.simplefilter("ignore")  # memory alone is looked at
 
 def peak():
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

@@ -1,9 +1,7 @@
 """The page in a browser, on a desk and on a telephone: nothing overflows, nothing hostile runs."""
 
-import pandas as pd
 import pytest
 
-from pyro_dynogp.models.description import Part
 from pyro_dynogp.report.html.page import page
 from tests.discrepancy import reports
 from tests.report.browser import BROWSER, measured
@@ -27,35 +25,11 @@ HOSTILE = (
 )
 
 
-def with_names(name, unit="m"):
-    """A report in which a name is everywhere where a file can put one."""
-    w = reports.record(240)
-    stamps = pd.date_range("2024-03-30", periods=240, freq="1h", tz="Europe/Vienna")
-    record = type(w)(
-        stamps, w.inputs, w.outputs, input_names=["u" + name], output_names=[name],
-        input_units=[unit], output_units=[unit], extra={name + "c": w.outputs[:, 0]}, name=name,
-    )  # fmt: skip
-    known, sealed = record.split(180)
-    forecast = reports.prediction(sealed)
-    found = reports.effect(
-        name=name, sentence=name, block=name, parameters={name: (1.0, 0.1)}, ties=(name,),
-        experiment=name, curve=reports.curve(x_label=name, y_label=name),
-    )  # fmt: skip
-    return reports.report(
-        known=known, sealed=sealed, forecast_before=forecast, forecast_after=forecast,
-        effects=(found,), warnings=(name,), data=name, model_before=(Part(name, name),),
-        model_after=(Part(name, name), Part("long", name * 3)),
-        last_block_tests={name: (0.1, 0.2)}, seconds={name: 1.0},
-        attempts=(reports.attempt(1, name, 0.01, "rejected", name),
-                  reports.attempt(1, name, 0.1, "not tried", name)),
-    )  # fmt: skip
-
-
 PAGES = {
     "usual": reports.report,
     "nothing missing": reports.nothing,
-    "long words": lambda: with_names(
-        "a_channel_with_a_name_that_never_ends_" * 6, "kg*m^2/s^3" * 4
+    "long words": lambda: reports.with_names(
+        "a_channel_with_a_name_that_never_ends_" * 6, *["kg*m^2/s^3" * 4] * 2
     ),
 }
 
@@ -77,7 +51,7 @@ def test_nothing_overflows_and_no_column_is_narrower_than_eight_characters(name,
 
 @pytest.mark.parametrize("name", HOSTILE)
 def test_hostile_names_are_text(name):
-    found = measured(page(with_names(name, name)), WIDTHS[1])
+    found = measured(page(reports.with_names(name, name, name)), WIDTHS[1])
     assert found["ran"] == []
     assert found["injected"] == 0
     check(found, WIDTHS[1])

@@ -6,7 +6,6 @@ import re
 from html.parser import HTMLParser
 
 import numpy as np
-import pandas as pd
 import pytest
 
 import pyro_dynogp as dgp
@@ -174,28 +173,7 @@ def test_models(found):
 
 
 def test_names_of_users_files():
-    w = reports.record(240)
-    stamps = pd.date_range("2024-03-30", periods=240, freq="1h", tz="Europe/Vienna")
-    record = type(w)(
-        stamps, w.inputs, w.outputs, input_names=[EVIL + "u"], output_names=[EVIL],
-        input_units=["<V>"], output_units=["$ & $"], extra={EVIL + "c": w.outputs[:, 0]}, name=EVIL,
-    )  # fmt: skip
-    known, sealed = record.split(180)
-    forecast = reports.prediction(sealed)
-    evil = reports.effect(
-        name=EVIL, sentence=EVIL, block=EVIL, parameters={EVIL: (1.0, 0.1)}, ties=(EVIL,),
-        experiment=EVIL, curve=reports.curve(x_label=EVIL, y_label=EVIL),
-    )  # fmt: skip
-    source, found = checked(
-        reports.report(
-            known=known, sealed=sealed, forecast_before=forecast, forecast_after=forecast,
-            effects=(evil,), warnings=(EVIL,), data=EVIL, model_before=(Part(EVIL, EVIL),),
-            model_after=(Part(EVIL, EVIL), Part("long", EVIL * 3)),
-            last_block_tests={EVIL: (0.1, 0.2)}, seconds={EVIL: 1.0},
-            attempts=(reports.attempt(1, EVIL, 0.01, "rejected", EVIL),
-                      reports.attempt(1, EVIL, 0.1, "not tried", EVIL)),
-        )
-    )  # fmt: skip
+    source, found = checked(reports.with_names(EVIL, "<V>", "$ & $"))
     assert found.text.count(EVIL) >= 20
     assert html.escape(EVIL) in source
     assert EVIL not in source

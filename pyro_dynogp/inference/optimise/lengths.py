@@ -11,8 +11,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 
-from pyro_dynogp.inference.density import Site
+from pyro_dynogp.inference.density import Site, parts
 from pyro_dynogp.inference.optimise.lockstep import Functions
 from pyro_dynogp.models.gauge import usual_length
 
@@ -26,15 +27,12 @@ class Lengths:
 
     def __init__(self, sites: Sequence[Site]) -> None:
         self._places: list[tuple[np.ndarray, float]] = []
-        before = 0
-        for site in sites:
-            count = site.unconstrained.numel()
+        size = sum(site.unconstrained.numel() for site in sites)
+        for site, entries in parts(sites, torch.arange(size)):
             if site.name.endswith("_output_gain"):
-                signals, pairs, two = site.shape
-                entries = before + np.arange(count).reshape(signals, pairs, two)
-                places: np.ndarray = entries.swapaxes(0, 1).reshape(pairs, -1)
+                signals, pairs, _ = site.shape
+                places: np.ndarray = entries.transpose(0, 1).reshape(pairs, -1).numpy()
                 self._places.append((places, usual_length(signals)))
-            before += count
 
     def energies(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What is added to energies at z (k, d), (k,), none at usual lengths; gradients (k, d)."""

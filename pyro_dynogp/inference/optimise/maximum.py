@@ -290,6 +290,11 @@ def optimizer_for(model: Model) -> Optimizer:
     """
     if has_innovations(model) and (model.is_linear or model.has_feedback):
         return "gauss-newton"
+    return optimizer_by_gradients(model)
+
+
+def optimizer_by_gradients(model: Model) -> Optimizer:
+    """Adam for functions, but for those in feedback, else L-BFGS."""
     return "adam" if model.has_function and not model.has_feedback else "lbfgs"
 
 

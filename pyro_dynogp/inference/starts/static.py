@@ -36,7 +36,8 @@ def start_static(
     x = torch.cat(list(seen))
     d, e, M = one.channels, layer.outputs, layer.inducing
     low, high = x.amin(0), x.amax(0)
-    order = torch.arange(d) if d == e else smoothest_first(seen)
+    smoothest = smoothest_first(seen)
+    order = torch.arange(d) if d == e else smoothest
     if reach is not None and line is not None and d == 1:
         # Process noise takes the input further than its mean goes: to where the outputs came from.
         back = (reach - line[1]) / line[0]
@@ -54,7 +55,7 @@ def start_static(
     else:  # where the data are, spread along the record
         index = torch.linspace(0, len(x) - 1, M).round().long()
         cloud = torch.quasirandom.SobolEngine(d).draw(M, dtype=torch.float64) - 0.5
-        cloud = cloud[:, smoothest_first(seen).argsort()]
+        cloud = cloud[:, smoothest.argsort()]
         values[f"{name}_locations"] = x[index] + 0.1 * (high - low) * cloud
     values[f"{name}_constant"] = torch.zeros(e, dtype=torch.float64)
     values[f"{name}_output_scale"] = torch.full((e,), 1.5, dtype=torch.float64)
