@@ -67,6 +67,7 @@ if TYPE_CHECKING:  # the same names, for editors and type checkers; a test compa
     from pyro_dynogp.models.layer import Static as Static
     from pyro_dynogp.models.model import Model as Model
     from pyro_dynogp.models.priors import sample_modes as sample_modes
+    from pyro_dynogp.models.step import Step as Step
     from pyro_dynogp.prediction.prediction import Prediction as Prediction
     from pyro_dynogp.prediction.scores import scores as scores
     from pyro_dynogp.report.loop import close_loop as close_loop
@@ -102,6 +103,7 @@ HOMES = {
     "Dynamic": "models.layer",
     "Known": "models.layer",
     "Static": "models.layer",
+    "Step": "models.step",
     "Gaussian": "layers.noise",
     "StudentT": "layers.noise",
     "Heteroscedastic": "layers.noise",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from pyro_dynogp.inference.posteriors import Mixture, Posterior, Sampled
 from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.layers.sites import Values
 from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.step import Step, is_step
 from pyro_dynogp.models.wiring import Dynamic, Known, Layer, Static
 from pyro_dynogp.support.checkpoints import DIGEST, read_tensors, write_tensors
 from pyro_dynogp.support.errors import invalid
@@ -38,7 +39,7 @@ VERSION, OLDEST, UNMARKED = 7, 4, 5
 MODELS = ("Model", "Cascade", "LinearDynamicGP")
 # Arrays of draws with densities, where there are such.
 SOURCE = ("log_p", "log_q", "ancestor")
-LAYERS: dict[str, type[Dynamic] | type[Static]] = {"Dynamic": Dynamic, "Static": Static}
+LAYERS: dict[str, Callable[..., Layer]] = {"Dynamic": Dynamic, "Static": Static, "Step": Step}
 
 
 def save(fit: Fitted, path: str | Path) -> None:
@@ -179,7 +180,7 @@ def _options(model: Model) -> dict[str, Any]:
     options = {f.name: getattr(model, f.name) for f in fields(model) if f.name != "scaling"}
     options["channels"] = [to_plain(channel) for channel in model.channels]
     for wire in model.wires:
-        if isinstance(wire.layer, Known):
+        if isinstance(wire.layer, Known) and not is_step(wire.layer):
             raise invalid(
                 "save",
                 expected="layers that are numbers alone",
@@ -194,12 +195,16 @@ def _options(model: Model) -> dict[str, Any]:
                 advice="A file holds numbers alone, no kernel of gpytorch: keep fit.draws and "
                 "the code that makes the model.",
             )
-    options["layers"] = [
-        {"kind": type(layer).__name__, **{f.name: getattr(layer, f.name) for f in fields(layer)}}
-        for layer in model.layers
-    ]
+    options["layers"] = [_plain(layer) for layer in model.layers]
     options["likelihood"] = asdict(model.likelihood)
     return options
+
+
+def _plain(layer: Layer) -> dict[str, Any]:
+    """A layer as JSON has it."""
+    kind = "Step" if is_step(layer) else type(layer).__name__
+    names = ("skip", "sees", "name") if is_step(layer) else [f.name for f in fields(layer)]
+    return {"kind": kind, **{name: getattr(layer, name) for name in names}}
 
 
 def _model(name: str, options: Mapping[str, Any], scaling: Scaling) -> Model:

@@ -10,6 +10,7 @@ from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.stability import warnings_of
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.models.arrival import DELAY
+from pyro_dynogp.models.step import is_step
 from pyro_dynogp.models.wiring import Dynamic, Known, Layer
 
 
@@ -77,7 +78,7 @@ def _describe(layer: Layer) -> str:
         integrates = ", an integrator" if layer.integrators else ""
         return f"dynamic, {layer.pairs} pairs{integrates}{width}"
     if isinstance(layer, Known):
-        return f"known function{width}"
+        return f"{'step' if is_step(layer) else 'known function'}{width}"
     return f"static, {layer.inducing} inducing values{width}"
 
 

@@ -11,9 +11,10 @@ from pyro_dynogp.layers.kernels import ROUGH, SMOOTH
 from pyro_dynogp.layers.noise import Gaussian, Likelihood
 from pyro_dynogp.lti.modes import NoiseStructure
 from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.step import Step
 from pyro_dynogp.models.structure import ModelOptions
 from pyro_dynogp.models.wiring import Dynamic, Layer, Static
-from pyro_dynogp.support.errors import COUNT, verify
+from pyro_dynogp.support.errors import COUNT, SWITCH, invalid, verify
 
 
 def LinearDynamicGP(
@@ -208,6 +209,7 @@ def NonlinearFeedback(
     outputs: int = 1,
     pairs: int = 1,
     hidden: int = 0,
+    step: bool | None = None,
     inducing: int = 32,
     kernel: Kernel | None = None,
     process_noise: bool = True,
@@ -219,19 +221,35 @@ def NonlinearFeedback(
     A spring or friction that is not linear, a tank that empties through a valve:
     x' = A x + B u + F f(C x), y = C x + D u, with f held from sample to sample. Beyond the data f
     keeps its value. With hidden signals a second function f2 of h = H x comes back, too, and f is
-    named f1: friction where the position is measured, a tank above the one that is.
+    named f1: friction where the position is measured, a tank above the one that is. A `Step` beside
+    them is what Gaussian processes are too smooth for: a friction that changes sign, an edge that
+    a tank flows over.
 
     Args: as those of `Wiener`; f sees all outputs and has as many, the output measured is g's.
         hidden: number of signals that f2 sees and has as outputs.
+        step: whether a step of the hidden signal, or of the output where there is none, comes back
+            as well; by default with one hidden signal.
         kernel: of the functions, a gpytorch kernel; Matern-5/2 by default.
 
     Example:
         >>> model = NonlinearFeedback(1, pairs=1)
         >>> [wire.name for wire in model.wires], model.output_wire.name
         (['g', 'f'], 'g')
+        >>> [wire.name for wire in NonlinearFeedback(1, hidden=1).wires]
+        ['g', 'f1', 'f2', 'step']
     """
     verify(hidden=hidden)
-    back = ("f1", "f2") if hidden else ("f",)
+    if step is not None:
+        SWITCH.check("step", step)
+    width = hidden or outputs
+    if step and width > 1:
+        raise invalid(
+            "step", expected="None or False: a step sees one signal", got=f"True, {width} signals",
+            advice="A Cascade takes Step layers that see layers of one signal each.",
+        )  # fmt: skip
+    step = hidden == 1 if step is None else step
+    back: tuple[str, ...] = ("f1", "f2") if hidden else ("f1",) if step else ("f",)
+    back = (*back, "step") if step else back
     smoothness = SMOOTH if kernel is None else ROUGH
     layers: list[Layer] = [
         Dynamic(
@@ -246,6 +264,8 @@ def NonlinearFeedback(
                 smoothness=smoothness,
             )
         )  # fmt: skip
+    if step:
+        layers.append(Step(sees=("g_hidden" if hidden else "g",), name="step"))
     looped: ModelOptions = {"integrate": "all", "output": "g", **options}
     return Model(inputs, tuple(layers), likelihood or Gaussian(), **looped)
 

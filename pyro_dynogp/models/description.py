@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 from pyro_dynogp.data.channels import Channel
 from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.step import is_step
 from pyro_dynogp.models.wiring import Dynamic, Known, Layer
 
 
@@ -57,7 +58,8 @@ def _layer(layer: Layer, *, fed_back: bool) -> Part:
         integrates = ", an integrator" if layer.integrators else ""
         return Part("dynamics", "linear dynamics", f"{pairs}{integrates}, {noise}")
     if isinstance(layer, Known):
-        heading = "known function in feedback" if fed_back else "known function"
+        kind = "step" if is_step(layer) else "known function"
+        heading = f"{kind} in feedback" if fed_back else kind
         return Part("function", heading, ", ".join(layer.parameters))
     limits = [f"{at:.4g}" for at in layer.limits or () if at is not None]
     stops = f", stops at {' and '.join(limits)}" if limits else ""

@@ -22,7 +22,7 @@ from pyro_dynogp.layers.functions import even_grid
 from pyro_dynogp.layers.sites import Site, Values
 from pyro_dynogp.models.layer import in_double
 from pyro_dynogp.models.structure import Structure
-from pyro_dynogp.models.wiring import INPUTS, Known, Wire
+from pyro_dynogp.models.wiring import HIDDEN, INPUTS, Known, Wire
 from pyro_dynogp.moments.functions import gauss_hermite
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.tensors import as_tensor, broadcast
@@ -130,6 +130,7 @@ def known_function(
             finite there, or gives something else than it should.
     """
     widths = {wire.name: wire.layer.outputs for wire in model.wires}
+    widths |= {f"{wire.name}{HIDDEN}": layer.hidden for wire, layer in model.dynamic}
     shifts, scales, middles = [], [], []
     for source in place.sources:
         if source == INPUTS:
@@ -139,6 +140,8 @@ def known_function(
             scale, middle = scaling.output_scale, scaling.output_offset
         else:
             scale, middle = np.ones(widths[source]), np.zeros(widths[source])
+        if layer.scaled:
+            scale, middle = np.ones_like(scale), np.zeros_like(middle)
         scales.append(as_tensor(scale))
         middles.append(as_tensor(middle))
         offset = source == model.measured_signal and "offset" in values
@@ -153,6 +156,8 @@ def known_function(
     zero = torch.zeros(layer.outputs, dtype=torch.float64)
     name = f"layer {place.name!r}"
     f = KnownFunction(layer.function, parameters, shift, scale_, ends, zero, zero + 1.0, name)
+    if place.last and layer.scaled:
+        return f
     if place.last:
         level, size = as_tensor(scaling.output_offset), as_tensor(scaling.output_scale)
         return replace(f, centre=level, size=size)

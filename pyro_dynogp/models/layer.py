@@ -119,7 +119,8 @@ class Known:
     would have as its own. Other signals have no unit: it sees them as they are, and what goes on
     from it to other layers is shifted and scaled to mean zero and standard deviation one, for
     normal signals of the size of the training record and parameters in the middle of their priors.
-    The gains of the layer that sees it take up its size and sign: leave them out of the parameters.
+    With `scaled` inputs and output, too, are standard deviations from the mean of the training
+    record. The gains of the layer that sees it take up its size and sign: leave them out of the parameters.
 
     Args:
         function: torch, differentiable in the parameters and, in models whose trajectories are not
@@ -130,6 +131,7 @@ class Known:
         outputs: width of the layer.
         range: beyond these values of a signal [its unit] the function keeps its value; by default 8
             standard deviations from the mean of the training record.
+        scaled: whether it sees and gives inputs and output without their units.
         skip: names of earlier signals that the layer sees too. sees: those that it sees instead.
             More than one signal only where all of them are inputs, or static functions of inputs.
         name: prefix of its sites; f, or f1, f2, ... by default.
@@ -145,6 +147,7 @@ class Known:
     parameters: Mapping[str, dist.Distribution] = field(default_factory=dict)
     outputs: int = 1
     range: tuple[float, float] | None = None
+    scaled: bool = False
     skip: tuple[str, ...] = ()
     sees: tuple[str, ...] = ()
     name: str | None = None

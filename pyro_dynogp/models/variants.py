@@ -9,10 +9,12 @@ from pyro_dynogp.data.channels import Channel, count_direct
 from pyro_dynogp.layers.kernels import SMOOTH
 from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.step import Step
 from pyro_dynogp.models.wiring import (
     HIDDEN,
     INPUTS,
     Dynamic,
+    Known,
     Layer,
     Limits,
     Static,
@@ -22,8 +24,9 @@ from pyro_dynogp.models.wiring import (
 
 # Inducing values of a function that is added.
 INDUCING = 32
-# Names of functions that act back: of a layer's output, and of a signal of it that is hidden.
-FEEDBACK, HIDDEN_FEEDBACK = "feedback", "hidden_feedback"
+# Names of functions that act back: of a layer's output, and of a signal of it that is hidden, and
+# of a step of the latter.
+FEEDBACK, HIDDEN_FEEDBACK, STEP = "feedback", "hidden_feedback", "feedback_step"
 
 
 def with_channel(model: Model, channel: Channel) -> Model:
@@ -140,7 +143,8 @@ def with_feedback(model: Model, *, output: bool = True, hidden: bool = False) ->
 
     Args:
         model: to extend. output: whether one function sees the output of the layer.
-        hidden: whether one sees a further signal of the same states, which nothing measures.
+        hidden: whether one sees a further signal of the same states, which nothing measures, and a
+            step of it comes back as well.
     """
     noise = model.likelihood
     if not model.dynamic or noise.follows_output or not noise.gaussian:
@@ -149,11 +153,11 @@ def with_feedback(model: Model, *, output: bool = True, hidden: bool = False) ->
     sources = {wire.name: wire.sources for wire in model.wires}
     before = {sources[name] for name in layer.feedback}
     own, unseen = (seen.name,), (seen.name + HIDDEN,)
-    back = []
+    back: list[Static | Known] = []
     if output and own not in before:
         back.append(_smooth(FEEDBACK, own, layer.outputs))
     if hidden and unseen not in before:
-        back.append(_smooth(HIDDEN_FEEDBACK, unseen, 1))
+        back += [_smooth(HIDDEN_FEEDBACK, unseen, 1), Step(sees=unseen, name=STEP)]
     if not back or (model.has_feedback and not layer.feedback):
         return None
     names = (*layer.feedback, *(str(one.name) for one in back))

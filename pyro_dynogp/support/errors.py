@@ -129,7 +129,7 @@ RULES = {
     **dict.fromkeys(("restarts", "prior_samples", "refits", "channel", "inputs", "fed",
                      "hidden"), NUMBER),
     **dict.fromkeys(("progress", "forecasts", "process_noise", "feedthrough", "learn_locations",
-                     "pathwise"), SWITCH),
+                     "pathwise", "scaled"), SWITCH),
     "seed": Rule("a whole number from 0 to 2**63 - 1", whole(0, 2**63 - 1).plain),
     "level": SHARE,
     **dict.fromkeys(("learning_rate", "init_scale", "joint_scale", "gain_scale", "step", "duration",

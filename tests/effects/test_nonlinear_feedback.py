@@ -99,11 +99,12 @@ class TestBlock:
         variants = EFFECT.extend(dgp.LinearDynamicGP(1, pairs=2), None, spring)
         wired = [{w.name: (w.sources, w.feedback) for w in model.wires} for model in variants]
         output, hidden = (("g",), ()), (("g_hidden",), ())
+        unseen = ("hidden_feedback", "feedback_step")
         assert wired == [
             {"g": (("inputs",), ("feedback",)), "feedback": output},
-            {"g": (("inputs",), ("hidden_feedback",)), "hidden_feedback": hidden},
-            {"g": (("inputs",), ("feedback", "hidden_feedback")), "feedback": output,
-             "hidden_feedback": hidden},
+            {"g": (("inputs",), unseen), **dict.fromkeys(unseen, hidden)},
+            {"g": (("inputs",), ("feedback", *unseen)), "feedback": output,
+             **dict.fromkeys(unseen, hidden)},
         ]  # fmt: skip
         for model in variants:
             assert model.output_wire.name == "g"
@@ -122,11 +123,12 @@ class TestBlock:
         first, second, both = EFFECT.extend(dgp.LinearDynamicGP(1), None, spring)
         for model in (first, second):
             (more,) = EFFECT.extend(model, None, spring)
-            assert set(more.dynamic[0][0].feedback) == {"feedback", "hidden_feedback"}
+            back = {"feedback", "hidden_feedback", "feedback_step"}
+            assert set(more.dynamic[0][0].feedback) == back
             assert more.dynamic[0][1].hidden == 1
         assert EFFECT.extend(both, None, spring) == []
         (own,) = EFFECT.extend(dgp.NonlinearFeedback(1), None, spring)
-        assert own.dynamic[0][0].feedback == ("f", "hidden_feedback")
+        assert own.dynamic[0][0].feedback == ("f", "hidden_feedback", "feedback_step")
         assert EFFECT.extend(dgp.NonlinearFeedback(1, hidden=2), None, spring) == []
 
     def test_a_function_before_the_dynamics_stays(self, spring):

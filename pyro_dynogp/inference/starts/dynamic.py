@@ -114,14 +114,19 @@ class DynamicStart:
         return derivative + torch.tensor([float(ahead), 0.0], dtype=torch.float64)
 
     def _fed_back(self, gain: Tensor) -> Tensor:
-        """Gains (P, d + fed, 2): what comes back acts somewhat as the inputs do, sign at random."""
-        shape = (len(gain), self.one.fed, 2)
+        """Gains (P, d + fed, 2): what comes back acts somewhat as the inputs do, sign at random.
+
+        What comes back from known functions is not nothing at first: their gains are small.
+        """
         wires = {wire.name: wire for wire in self.model.wires}
-        if any(isinstance(wires[name].layer, Known) for name in self.one.feedback):
-            return torch.cat([gain, self._random(*shape)], 1)  # it is not nothing at first
-        like = gain.mean(1, keepdim=True) if gain.shape[1] else torch.ones(shape).double()
         sign = float(self.generator.choice([-1.0, 1.0]))
-        return torch.cat([gain, 0.5 * sign * like.expand(shape) + self._random(*shape)], 1)
+        like = gain.mean(1, keepdim=True) if gain.shape[1] else gain.new_ones(len(gain), 1, 2)
+        back = []
+        for name in self.one.feedback:
+            layer = wires[name].layer
+            own = self._random(len(gain), layer.outputs, 2)
+            back.append(own if isinstance(layer, Known) else 0.5 * sign * like + own)
+        return torch.cat([gain, *back], 1)
 
     def near_identity(self) -> Values:
         """Each output is an input, beside small random dynamics."""

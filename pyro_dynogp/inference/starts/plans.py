@@ -38,6 +38,8 @@ class Plan:
         seed: of everything random.
         ahead: whether hidden signals of the leading layer start as what a first-order lag before
             the output sees; else as the output's derivative.
+        usual: whether parameters of known functions start in the middle of their priors; else they
+            are drawn.
     """
 
     leading: str | None
@@ -45,6 +47,7 @@ class Plan:
     curved: bool
     seed: int
     ahead: bool = True
+    usual: bool = True
 
 
 def plans(
@@ -74,7 +77,7 @@ def plans(
         else:
             linear = found[used[name] % len(found)]
             used[name] += 1
-        out.append(Plan(name, linear, curved, s, ahead=turn % 2 == 0))
+        out.append(Plan(name, linear, curved, s, ahead=turn % 2 == 0, usual=turn < 2))
     return out
 
 
@@ -124,7 +127,7 @@ def starting_point(model: Model, records: Sequence[PreparedRecord], plan: Plan) 
             outputs = [o * factor for o in outputs]
         elif isinstance(one.layer, Known):
             for site in known_sites(one.name, one.layer):
-                values[site.name] = middle_of(site)
+                values[site.name] = middle_of(site) if plan.usual else site.prior.sample()
             values["offset"] = level
             function = known_function(model, one, one.layer, values, scaling)
             outputs = [function.mean(s) for s in seen]
