@@ -198,6 +198,8 @@ class Scaling:
         return hash((self.time_step, self.duration, self.input_names, self.output_names))
 
 
+# Largest numbers of a signal, and one over the smallest: squares of what is made of them have room.
+LARGEST = 1e100
 # Samples below which a record is short: it may show a part of what the system does.
 SHORT = 100.0
 
@@ -284,13 +286,27 @@ def _statistics(role: str, arrays: list[Array], names: tuple[str, ...]) -> tuple
             raise invalid(
                 f"{role} {name!r}", expected="samples to learn from", got="missing samples alone"
             )
+        low, high = float(seen.min()), float(seen.max())
+        largest = max(abs(low), abs(high))
+        varies = f"numbers from {low:.9g} to {high:.9g}"
+        if low < high and not 1.0 / LARGEST < largest < LARGEST:
+            raise invalid(
+                f"{role} {name!r}",
+                expected=f"numbers of a size between {1.0 / LARGEST:g} and {LARGEST:g}, whose "
+                "squares are numbers, too",
+                got=varies,
+                advice="State the signal in another unit.",
+            )
         offset[i], scale[i] = seen.mean(), seen.std()
-        if scale[i] <= 1e-12 * np.abs(seen).max():
+        if scale[i] <= 1e-12 * largest:
+            rounding = f"{varies}, which differ by rounding alone"
             raise invalid(
                 f"{role} {name!r}",
                 expected="a signal that varies",
-                got=f"the constant {seen[0]:g}",
-                advice="There is nothing to identify: train on data in which it moves."
+                got=rounding if low < high else f"the constant {low:g}",
+                advice="Record it less the level that it varies around."
+                if low < high
+                else "There is nothing to identify: train on data in which it moves."
                 if role == "output"
                 else "Leave the input out (Record.select): a constant acts through the output "
                 "offset alone.",
