@@ -18,9 +18,10 @@ LINES = 31_500
 # signals (180 lines), dead times with a posterior (1230 lines), simulated plants with feedback
 # (320 lines), the same fit in any unit and order (310 lines), large files (90 lines), draws of all
 # parameters of models with functions (430 lines) and kernels by the evidence (270 lines), one
-# order of channels (120 lines) and files that are written whole (80 lines) came since. To shrink,
+# order of channels (120 lines), files that are written whole (80 lines) and checks of what readers
+# are given (90 lines) came since. To shrink,
 # and to go.
-LINES_TODAY = 47_150
+LINES_TODAY = 47_160
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

@@ -369,7 +369,7 @@ class TestChannels:
         assert "level" in record.extra
 
     def test_select_refuses(self):
-        with refused("select", "['flow', 'heat', 'level', 'rain']", "'wind'"):
+        with refused("inputs", "['flow', 'heat', 'level', 'rain']", "'wind'"):
             example().select(inputs=["wind"])
         with refused("names", "'level' 2 times"):
             example().select(inputs=["level"])
