@@ -235,6 +235,20 @@ def test_order_of_outputs(kind, first):
             np.testing.assert_allclose(b.modes.poles.numpy(), a.modes.poles.numpy(), rtol=SAME)
 
 
+@pytest.mark.parametrize("channel", ["u", "y"])
+def test_a_level_far_above_what_varies(channel, first):
+    """A million and some tenths: the first six digits say nothing."""
+    record = KINDS["linear"].record()
+    inputs, outputs = record.inputs.copy(), record.outputs.copy()
+    (inputs if channel == "u" else outputs)[:, 0] += 1e6
+    names: dict[str, Any] = {
+        "input_names": record.input_names, "output_names": record.output_names,
+    }  # fmt: skip
+    other = told(KINDS["linear"], dgp.Record(record.time, inputs, outputs, **names))
+    level = 1e6 if channel == "y" else 0.0
+    same(first("linear"), dataclasses.replace(other, mean=other.mean - level))
+
+
 @pytest.mark.parametrize("change", ["inputs", "outputs", "units"])
 def test_a_pair_too_many_is_not_told_from_rounding_but_forecasts_are_the_same(change):
     """The second pair of this record has no pole of its own: the density is flat along it."""
