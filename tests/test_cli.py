@@ -269,7 +269,7 @@ def test_errors_of_the_system_name_the_file(fitted, folder, tmp_path, monkeypatc
     monkeypatch.setattr(pd.DataFrame, "to_csv", denied)
     arguments = (folder / "plant.safetensors", folder / "plant.csv", "--sampling-time", 0.5)
     result = run("simulate", *arguments, "--out", tmp_path / "out.csv")
-    refused(result, "out.csv: Permission denied.")
+    refused(result, f"{tmp_path}/out.csv (Permission denied).")
 
 
 # info

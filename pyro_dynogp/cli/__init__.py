@@ -84,6 +84,8 @@ def demo(directory: Path, quiet: bool) -> None:
     """  # noqa: D301
     from pyro_dynogp.cli.demonstration import run_demo
 
+    directory.mkdir(parents=True, exist_ok=True)
+    check_folder("--output", directory / "report.html")
     run_demo(directory, progress=not quiet)
 
 
@@ -178,7 +180,7 @@ def fit(
     )
     click.echo(fitted.summary())
     if save is not None:
-        click.echo(f"saved to {saved(fitted, save)}")
+        click.echo(f"saved to {saved(fitted.save, save)}")
     results = None
     if test is not None:
         past = first if parts.follows else None
@@ -229,6 +231,7 @@ def simulate(
         raise InvalidInput("--no-process-noise: for simulations; leave it out with --horizon.")
     check_folder("--out", out)
     from pyro_dynogp import load
+    from pyro_dynogp.support.writing import write_result
 
     fitted = load(model)
     record, has_outputs = record_for(fitted, data, clock)
@@ -246,8 +249,8 @@ def simulate(
     if str(out) == "-":
         click.echo(frame.to_csv(), nl=False)
     else:
-        frame.to_csv(out)
-        click.echo(f"{len(frame)} rows in {out}")
+        there = saved(lambda path: write_result(path, frame.to_csv, "The table"), out)
+        click.echo(f"{len(frame)} rows in {there}")
 
 
 main.add_command(close_loop)

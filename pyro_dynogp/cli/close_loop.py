@@ -104,10 +104,10 @@ def close_loop(
         progress=not quiet,
     )
     click.echo(str(report))
-    report.to_html(out / "report.html")
-    report.to_json(out / "report.json")
-    model = saved(report.fit, out / "model.safetensors")
-    click.echo(f"\nReport: {out / 'report.html'} (numbers: {out / 'report.json'})")
+    page = saved(report.to_html, out / "report.html")
+    numbers = saved(report.to_json, out / "report.json")
+    model = saved(report.fit.save, out / "model.safetensors")
+    click.echo(f"\nReport: {page} (numbers: {numbers})")
     which = "the model before" if report.model_kept else "the extended model"
     which = which if report.extended is not report.base else "the model as given"
     click.echo(f"Model:  {model} ({which}; pyro_dynogp.load reads it)")

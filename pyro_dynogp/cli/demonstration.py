@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from pyro_dynogp import plotting
 from pyro_dynogp.data.record import Record
@@ -20,6 +21,7 @@ from pyro_dynogp.prediction.prediction import Prediction
 from pyro_dynogp.prediction.scores import scores
 from pyro_dynogp.report.loop import close_loop
 from pyro_dynogp.report.report import Report
+from pyro_dynogp.support.writing import write_result, write_text
 
 HONEST = (
     "The speed sensor of this machine reports the absolute value of the speed, which no linear "
@@ -84,6 +86,11 @@ def score_table(results: Mapping[str, Result], test: Record) -> str:
     return "\n".join(lines)
 
 
+def _draw(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG."""
+    write_result(path, lambda part: figure.savefig(part, dpi=150, format="png"), "The fit")
+
+
 def write_figures(
     fit: Fit,
     directory: Path,
@@ -123,7 +130,7 @@ def write_figures(
     written = []
     for name, figure in figures.items():
         path = directory / f"{name}.png"
-        figure.savefig(path, dpi=150)
+        _draw(figure, path)
         written.append(path)
     return written
 
@@ -180,11 +187,11 @@ def run_demo(
         fitted, directory, train=data.train, test=data.test, results=results, skip=data.skip
     )
     # The record figure of a demonstration shows the test part as well.
-    plotting.record(data.full).savefig(directory / "record.png", dpi=150)
+    _draw(plotting.record(data.full), directory / "record.png")
     model_file, score_file = directory / "drives.safetensors", directory / "scores.json"
     fitted.save(model_file)
     numbers = {name: dict(result.scores) for name, result in results.items()}
-    score_file.write_text(json.dumps(numbers, indent=2) + "\n", encoding="utf-8")
+    write_text(score_file, json.dumps(numbers, indent=2) + "\n", "The demonstration")
     print(f"\n{HONEST}\n")
     report = None
     if rounds:

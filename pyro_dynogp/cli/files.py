@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from pyro_dynogp.cli.data import InvalidInput
-
-if TYPE_CHECKING:
-    from pyro_dynogp.fitting import Fit
 
 
 def check_folder(option: str, path: Path) -> None:
@@ -28,13 +25,21 @@ def check_folder(option: str, path: Path) -> None:
         ) from error
 
 
-def saved(fit: Fit, path: Path) -> Path:
-    """Save a fit, elsewhere where this cannot be done; the file that it is in."""
+def saved(write: Callable[[Path], object], path: Path) -> Path:
+    """Write what was computed, elsewhere where this cannot be done; the file that it is in.
+
+    Args:
+        write: writes a file, or raises the ValueError of `support.writing`. path: of the file.
+    """
     try:
-        fit.save(path)
+        write(path)
     except ValueError as error:
         other = Path(tempfile.mkdtemp(prefix="pyro-dynogp-")) / path.name
-        fit.save(other)
+        try:
+            write(other)
+        except ValueError:
+            other.parent.rmdir()
+            raise error from None  # of the file that was asked for
         click.echo(f"{error}\nSaved elsewhere: move {other} to where it is to be.", err=True)
         return other
     return path

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -93,9 +93,18 @@ def check_finite(
     )
 
 
-def as_names(value: str | Sequence[str]) -> tuple[str, ...]:
-    """One name or several as a tuple."""
-    return (value,) if isinstance(value, str) else tuple(value)
+def as_names(value: str | Sequence[str], argument: str = "names") -> tuple[str, ...]:
+    """One name or several as a tuple.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    if isinstance(value, str):
+        return (value,)
+    if isinstance(value, bytes | Mapping) or not isinstance(value, Iterable):
+        expected = "a name, or a list of names"
+        raise invalid(argument, expected=expected, got=f"a {type(value).__name__}")
+    return tuple(value)
 
 
 def check_unique(names: tuple[str, ...]) -> None:
@@ -117,7 +126,7 @@ def as_texts(
         return tuple(f"{default}{i + 1}" if several else default for i in range(count))
     if not isinstance(value, str | Sequence | np.ndarray):
         raise invalid(argument, expected=f"{count} texts", got=repr(value))
-    texts = as_names(value)
+    texts = as_names(value, argument)
     wrong = [t for t in texts if not isinstance(t, str) or (unique and not t)]
     if wrong or len(texts) != count:
         raise invalid(argument, expected=f"{count} non-empty texts" if unique else f"{count} texts",

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from numbers import Real
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, TypedDict, Unpack
+from typing import Any, Unpack
 
 import numpy as np
 import pandas as pd
@@ -14,33 +14,9 @@ import xarray as xr
 
 from pyro_dynogp.data.checks import Array, Names
 from pyro_dynogp.data.fields import RecordFields
+from pyro_dynogp.data.reader_options import ColumnOptions, TextOptions, checked_options
 from pyro_dynogp.data.text_table import localise, named_column, no_number, read_table
-from pyro_dynogp.support.errors import invalid
-
-
-class ColumnOptions(TypedDict, total=False):
-    """Options of every reader; `read_frame` says what they mean."""
-
-    output: Names
-    time: str | None
-    sampling_time: float | None
-    timezone: str | None
-    time_unit: str | None
-    extra: Literal["all"] | Sequence[str] | None
-    input_units: Names
-    output_units: Names
-    extra_units: Mapping[str, str] | None
-    name: str | None
-
-
-class TextOptions(ColumnOptions, total=False):
-    """Options of `read_csv`."""
-
-    header: bool | None
-    names: Sequence[str] | None
-    delimiter: str | None
-    decimal: str | None
-    encoding: str
+from pyro_dynogp.support.errors import PATH, instance, invalid
 
 
 def read_frame(
@@ -75,7 +51,8 @@ def read_frame(
         ValueError: unknown columns, cells that are no numbers, no times or two sources of them,
             stamps without a zone, local times that daylight saving makes ambiguous.
     """
-    _check_options(options, ColumnOptions)
+    inputs, outputs = checked_options(options, ColumnOptions, inputs, outputs)
+    instance("frame", frame, pd.DataFrame)
     columns = {str(key): frame[key] for key in frame.columns}
     if len(columns) != frame.shape[1]:
         raise invalid("frame", expected="unique column names", got=f"{list(map(str, frame))}")
@@ -127,7 +104,8 @@ def read_xarray(
     Raises:
         ValueError: no such time coordinate, unknown variables, and as in `read_frame`.
     """
-    _check_options(options, ColumnOptions)
+    inputs, outputs = checked_options(options, ColumnOptions, inputs, outputs)
+    instance("dataset", dataset, xr.Dataset)
     time = options.get("time") or "time"
     if time not in dataset.coords or dataset[time].dims != (time,):
         raise invalid(
@@ -199,7 +177,8 @@ def read_csv(
             too many cells; no times or two sources of them; stamps without a zone, or that
             daylight saving makes ambiguous.
     """
-    _check_options(options, TextOptions)
+    inputs, outputs = checked_options(options, TextOptions, inputs, outputs)
+    PATH.check("path", path)
     table = read_table(
         Path(path), options.get("header"), options.get("names"), options.get("delimiter"),
         options.get("decimal"), options.get("encoding", "utf-8-sig"),
@@ -215,14 +194,6 @@ def read_csv(
     )  # fmt: skip
 
 
-def _check_options(options: Mapping[str, object], known: type) -> None:
-    for option in options:
-        if option not in known.__annotations__:
-            raise TypeError(
-                f"{option!r} is no option of this reader, which knows {list(known.__annotations__)}"
-            )
-
-
 def _series_numbers(key: str, series: pd.Series) -> Array:
     kind = series.dtype
     if pd.api.types.is_numeric_dtype(kind) and not pd.api.types.is_complex_dtype(kind):
@@ -232,7 +203,7 @@ def _series_numbers(key: str, series: pd.Series) -> Array:
     values = np.empty(len(series))
     for row, cell in enumerate(series):
         if not isinstance(cell, (bool, int, float, np.number, np.bool_)) and not pd.isna(cell):
-            raise no_number(f"row {series.index[row]!r}", key, cell)
+            raise no_number(f"row {series.index[row]}", key, cell)
         values[row] = np.nan if pd.isna(cell) else cell
     return values
 

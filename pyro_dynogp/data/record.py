@@ -243,12 +243,13 @@ class Record:
         Raises:
             ValueError: an unknown name, or one chosen twice.
         """
-        chosen_u = self.input_names if inputs is None else as_names(inputs)
-        chosen_y = self.output_names if outputs is None else as_names(outputs)
+        chosen_u = self.input_names if inputs is None else as_names(inputs, "inputs")
+        chosen_y = self.output_names if outputs is None else as_names(outputs, "outputs")
         values, units = self._channels.values, self._channels.units
-        for name in (*chosen_u, *chosen_y):
-            if name not in values:
-                raise invalid("select", expected=f"names among {list(values)}", got=repr(name))
+        for argument, chosen in (("inputs", chosen_u), ("outputs", chosen_y)):
+            for name in chosen:
+                if not isinstance(name, str) or name not in values:
+                    raise invalid(argument, expected=f"names among {list(values)}", got=repr(name))
         check_unique((*chosen_u, *chosen_y))
         rest = [name for name in values if name not in (*chosen_u, *chosen_y)]
         empty = np.empty((len(self), 0))
@@ -270,7 +271,7 @@ class Record:
         Raises:
             ValueError: there is no such extra channel, or it has gaps.
         """
-        if name not in self.extra:
+        if not isinstance(name, str) or name not in self.extra:
             raise invalid("name", expected=f"an extra channel {list(self.extra)}", got=repr(name))
         return self.select(inputs=(*self.input_names, name))
 
@@ -293,7 +294,7 @@ class Record:
             units = self.output_units if same_number else ("",) * new.shape[1]
         names = self.output_names if names is None else as_names(names)
         return dataclasses.replace(
-            self, outputs=new, output_names=names, output_units=as_names(units)
+            self, outputs=new, output_names=names, output_units=as_names(units, "units")
         )
 
     def tensors(self) -> RecordTensors:

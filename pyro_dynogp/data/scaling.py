@@ -17,6 +17,7 @@ from pyro_dynogp.support.errors import invalid, verify_fields, whole
 
 _ARRAYS = ("input_offset", "input_scale", "output_offset", "output_scale")
 _NAMES = ("input_names", "output_names", "input_units", "output_units")
+_ORDERS = ("input_order", "output_order")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -39,6 +40,10 @@ class Scaling:
         time_unit: unit of time.
         reference_output: place of the smoothest output, by which the phases of modes are told: the
             same one in whatever order and units the outputs are given.
+        input_order: places of the inputs from the smoothest to the roughest, the same channels in
+            whatever order and units they are given; what a function of several channels does
+            channel by channel goes by it. By default as they are given.
+        output_order: places of the outputs, likewise.
     """
 
     time_step: float
@@ -53,6 +58,8 @@ class Scaling:
     output_units: tuple[str, ...]
     time_unit: str
     reference_output: int = 0
+    input_order: tuple[int, ...] = ()
+    output_order: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         for field in _ARRAYS:
@@ -61,6 +68,8 @@ class Scaling:
             object.__setattr__(self, field, array)
         outputs = len(self.output_scale)
         whole(0, max(outputs - 1, 0)).check("reference_output", self.reference_output)
+        for field, count in zip(_ORDERS, (len(self.input_scale), outputs), strict=True):
+            object.__setattr__(self, field, _permutation(field, getattr(self, field), count))
 
     @classmethod
     def from_records(cls, records: Record | Sequence[Record]) -> Scaling:
@@ -89,6 +98,8 @@ class Scaling:
         y_offset, y_scale = _statistics("output", [r.outputs for r in several], first.output_names)
         # The mean step of a regular record carries less rounding than the median of differences.
         regular = len(several) == 1 and first.is_regular
+        inputs = by_smoothness([(r.inputs - u_offset) / u_scale for r in several])
+        outputs = by_smoothness([(r.outputs - y_offset) / y_scale for r in several])
         return cls(
             time_step=first.sampling_time if regular else float(np.median(steps)),
             duration=max(record.duration for record in several),
@@ -97,7 +108,9 @@ class Scaling:
             output_offset=y_offset,
             output_scale=y_scale,
             time_unit=first.time_unit,
-            reference_output=_smoothest([(r.outputs - y_offset) / y_scale for r in several]),
+            reference_output=outputs[0],
+            input_order=inputs,
+            output_order=outputs,
             **{field: getattr(first, field) for field in _NAMES},
         )
 
@@ -148,18 +161,21 @@ class Scaling:
             elif isinstance(value, float):
                 plain[field.name] = value.hex()
             else:
-                plain[field.name] = list(value) if field.name in _NAMES else value
+                plain[field.name] = list(value) if isinstance(value, tuple) else value
         return plain
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> Scaling:
-        """Scaling from what `to_dict` gave; before format 7 the first output was the reference.
+        """Scaling from what `to_dict` gave.
+
+        Files of before have channels in the order in which they were given, the first output as the
+        reference.
 
         Raises:
             ValueError: missing or unknown entries, or text that is no hexadecimal number.
         """
         fields = {field.name for field in dataclasses.fields(cls)}
-        if not fields - {"reference_output"} <= set(plain) <= fields:
+        if not fields - {"reference_output", *_ORDERS} <= set(plain) <= fields:
             raise invalid("plain", expected=f"entries {sorted(fields)}", got=f"{sorted(plain)}")
         values = dict(plain)
         try:
@@ -170,6 +186,7 @@ class Scaling:
         except (TypeError, ValueError) as error:
             raise invalid("plain", expected="float.hex texts", got=str(error)) from error
         values |= {field: tuple(plain[field]) for field in _NAMES}
+        values |= {field: tuple(plain.get(field, ())) for field in _ORDERS}
         return cls(**values)
 
     def __eq__(self, other: object) -> bool:
@@ -181,6 +198,8 @@ class Scaling:
         return hash((self.time_step, self.duration, self.input_names, self.output_names))
 
 
+# Largest numbers of a signal, and one over the smallest: squares of what is made of them have room.
+LARGEST = 1e100
 # Samples below which a record is short: it may show a part of what the system does.
 SHORT = 100.0
 
@@ -225,12 +244,36 @@ class TimeScale:
         return math.exp(0.5 * sum(self.rate_bounds))
 
 
-def _smoothest(outputs: Sequence[Array]) -> int:
-    """Place of the scaled output that changes least from one sample to the next."""
-    changes = np.concatenate([np.diff(y, axis=0) for y in outputs])
-    there = ~np.isnan(changes)
-    total = np.square(np.where(there, changes, 0.0)).sum(0)
-    return int(np.argmin(np.where(there.any(0), total / np.maximum(there.sum(0), 1), np.inf)))
+def by_smoothness(signals: Sequence[Array]) -> tuple[int, ...]:
+    """Places of scaled channels by how little they change from one sample to the next.
+
+    Channels that change alike, as switched signals may, go by when they are large. Both numbers are
+    rounded: in another order of channels sums round otherwise.
+
+    Args:
+        signals: (n, d) of each record, NaN where missing. What cannot be said comes last.
+    """
+    changes = np.concatenate([np.diff(x, axis=0) for x in signals])
+    pooled = np.concatenate(signals)
+    when = np.linspace(0.0, 1.0, len(pooled))[:, None]
+    return tuple(int(i) for i in np.lexsort((_rounded(when * pooled), _rounded(changes**2))))
+
+
+def _rounded(values: Array) -> Array:
+    """Mean of each column to nine digits after the point, gaps skipped; infinite without any."""
+    there = ~np.isnan(values)
+    mean = np.where(there, values, 0.0).sum(0) / np.maximum(there.sum(0), 1)
+    return np.where(there.any(0), np.round(mean, 9), np.inf)
+
+
+def _permutation(argument: str, given: Sequence[int], count: int) -> tuple[int, ...]:
+    """Places of so many channels, each once; as they are given where none is said."""
+    places = tuple(given) or tuple(range(count))
+    for place in places:
+        whole(0, max(count - 1, 0)).check(argument, place)
+    if len(set(places)) != count:
+        raise invalid(argument, expected=f"each place from 0 to {count - 1} once", got=f"{places}")
+    return places
 
 
 def _statistics(role: str, arrays: list[Array], names: tuple[str, ...]) -> tuple[Array, Array]:
@@ -243,13 +286,27 @@ def _statistics(role: str, arrays: list[Array], names: tuple[str, ...]) -> tuple
             raise invalid(
                 f"{role} {name!r}", expected="samples to learn from", got="missing samples alone"
             )
+        low, high = float(seen.min()), float(seen.max())
+        largest = max(abs(low), abs(high))
+        varies = f"numbers from {low:.9g} to {high:.9g}"
+        if low < high and not 1.0 / LARGEST < largest < LARGEST:
+            raise invalid(
+                f"{role} {name!r}",
+                expected=f"numbers of a size between {1.0 / LARGEST:g} and {LARGEST:g}, whose "
+                "squares are numbers, too",
+                got=varies,
+                advice="State the signal in another unit.",
+            )
         offset[i], scale[i] = seen.mean(), seen.std()
-        if scale[i] <= 1e-12 * np.abs(seen).max():
+        if scale[i] <= 1e-12 * largest:
+            rounding = f"{varies}, which differ by rounding alone"
             raise invalid(
                 f"{role} {name!r}",
                 expected="a signal that varies",
-                got=f"the constant {seen[0]:g}",
-                advice="There is nothing to identify: train on data in which it moves."
+                got=rounding if low < high else f"the constant {low:g}",
+                advice="Record it less the level that it varies around."
+                if low < high
+                else "There is nothing to identify: train on data in which it moves."
                 if role == "output"
                 else "Leave the input out (Record.select): a constant acts through the output "
                 "offset alone.",

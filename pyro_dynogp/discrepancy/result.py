@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from pyro_dynogp.statistics.evidence import Curve, Evidence
+from pyro_dynogp.support.errors import PATH
+from pyro_dynogp.support.writing import write_text
 
 if TYPE_CHECKING:
     from pyro_dynogp.data.record import Record
@@ -201,9 +203,14 @@ class LoopResult:
         }
 
     def to_json(self, path: str | Path) -> None:
-        """Write `to_dict` to a file; numbers that are not finite become null."""
+        """Write `to_dict` to a file; numbers that are not finite become null.
+
+        Raises:
+            ValueError: where the file cannot be written; what was there before is there.
+        """
+        PATH.check("path", path)
         text = json.dumps(_finite(self.to_dict()), indent=1, allow_nan=False)
-        Path(path).write_text(text + "\n", encoding="utf-8")
+        write_text(path, text + "\n", "The report")
 
     def __str__(self) -> str:
         lines = [self.headline]

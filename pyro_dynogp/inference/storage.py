@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from safetensors import SafetensorError
 from torch import Tensor
 from torch.distributions import biject_to
 
@@ -31,6 +30,7 @@ from pyro_dynogp.models.wiring import Dynamic, Known, Layer, Static
 from pyro_dynogp.support.checkpoints import DIGEST, read_tensors, write_tensors
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
+from pyro_dynogp.support.writing import unwritten
 
 FORMAT = "pyro_dynogp.fit"
 # Version 7 is written; 4 to 6 are read, too, of which 4 and 5 have no digest.
@@ -89,14 +89,8 @@ def save(fit: Fitted, path: str | Path) -> None:
     path = Path(path)
     try:
         write_tensors(path, tensors, {FORMAT: json.dumps(header)})
-    except (OSError, SafetensorError) as error:
-        why = getattr(error, "strerror", None) or error
-        raise invalid(
-            "path",
-            expected="a file in an existing folder that can be written to",
-            got=f"{path} ({why})",
-            advice="The fit is as it was, and so is a file that was there.",
-        ) from error
+    except OSError as error:
+        raise unwritten(path, error, "The fit") from error
 
 
 def load(path: str | Path) -> Fitted:

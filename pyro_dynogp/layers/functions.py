@@ -50,6 +50,8 @@ class StaticFunction:
         slope: (*b, e, d), slopes of the prior mean; None for a constant mean.
         name: what error messages call it.
         limits: where the prior mean stops, below and above; infinite where it does not.
+        order: places of its channels as whatever goes channel by channel takes them (quadrature,
+            support points); None as they are given.
 
     Raises:
         ValueError: if shapes do not fit together, or points have another number of channels.
@@ -64,6 +66,7 @@ class StaticFunction:
     slope: Tensor | None = None
     name: str = "static function"
     limits: tuple[float, float] = UNLIMITED
+    order: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         e, (M, d) = self.outputs, self.locations.shape[-2:]
@@ -198,6 +201,7 @@ class StaticFunction:
             self.slope,
             self.name,
             self.limits,
+            self.order,
         )
 
     def _check_points(self, argument: str, x: Tensor) -> None:
@@ -263,18 +267,23 @@ def even_grid(low: Tensor, high: Tensor, count: int) -> Tensor:
     return low.unsqueeze(-1) + (high - low).unsqueeze(-1) * share
 
 
-def support_points(locations: Tensor, count: int) -> Tensor:
+def in_place(columns: Tensor, order: Sequence[int] | None) -> Tensor:
+    """Columns (..., d) that are in this order of the channels, each in its channel's place."""
+    return columns if order is None else columns[..., torch.as_tensor(order).argsort()]
+
+
+def support_points(function: StaticFunction, count: int) -> Tensor:
     """Points (*b, K, d) at which the rest of a function is drawn: over where inducing points lie.
 
     One channel: an even grid. Several: the inducing locations spread by a Sobol sequence over
     their box. No gradient passes.
     """
-    z = locations.detach()
+    z = function.locations.detach()
     low, high = z.amin(-2, keepdim=True), z.amax(-2, keepdim=True)
     margin = 0.1 * (high - low) + 1e-3
     if z.shape[-1] == 1:
         unit = torch.linspace(0.0, 1.0, count, dtype=torch.float64).unsqueeze(-1)
     else:
         engine = torch.quasirandom.SobolEngine(z.shape[-1])
-        unit = engine.draw(count, dtype=torch.float64)
+        unit = in_place(engine.draw(count, dtype=torch.float64), function.order)
     return low - margin + (high - low + 2.0 * margin) * unit

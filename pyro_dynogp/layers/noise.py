@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -60,8 +60,17 @@ class Likelihood:
         """Whether the size of the noise is a function of the model's output."""
         return self.varying and self.of == "output"
 
-    def sites(self, outputs: int, inputs: int, *, flat: bool = False) -> tuple[Site, ...]:
+    def sites(
+        self,
+        outputs: int,
+        inputs: int,
+        *,
+        flat: bool = False,
+        order: tuple[int, ...] | None = None,
+    ) -> tuple[Site, ...]:
         """The sites of the noise of a model with so many outputs and inputs that drive it.
+
+        `order`: of the channels that the noise varies with, see `StaticPrior`.
 
         ``noise_sd`` (n_y,), log-normal around a tenth of the output's standard deviation; with
         `varying`, ``log_noise_...`` instead, those of a static layer of what drives it, which
@@ -73,7 +82,7 @@ class Likelihood:
         if self.varying:
             driver = "input" if self.of == "inputs" else "output"
             dims = {"input": driver, "inducing": "log_noise_inducing"}
-            return self._function(outputs, inputs).sites(dims)
+            return replace(self._function(outputs, inputs), order=order).sites(dims)
         zero = torch.zeros(outputs, dtype=torch.float64)
         prior = dist.LogNormal(zero + math.log(TYPICAL), zero + (FLAT if flat else 1.5))
         return (Site("noise_sd", prior.to_event(1), ("output",)),)

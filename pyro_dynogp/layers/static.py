@@ -21,7 +21,7 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from pyro_dynogp.layers.functions import JITTER, StaticFunction, even_grid
+from pyro_dynogp.layers.functions import JITTER, StaticFunction, even_grid, in_place
 from pyro_dynogp.layers.kernels import ROUGH, KernelPrior
 from pyro_dynogp.layers.sites import Site, Values, normal, sample
 from pyro_dynogp.support.errors import COUNT, checked, invalid, verify, verify_fields
@@ -74,6 +74,8 @@ class StaticPrior:
         learn_locations: whether the locations are learnt; else they stay at the start.
         locations: starting locations (M, d), or (M,) for one channel; by default
             `starting_locations`.
+        order: places of the channels as the sequence of starting locations takes them; None as
+            they are given.
 
     Raises:
         ValueError: if an option or shape is wrong.
@@ -88,6 +90,7 @@ class StaticPrior:
     learn_locations: bool = True
     locations: Any = None
     smoothness: float = ROUGH
+    order: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         verify_fields(self)
@@ -96,7 +99,7 @@ class StaticPrior:
     def start(self) -> Tensor:
         """Starting locations (M, d)."""
         if self.locations is None:
-            return starting_locations(self.inducing, self.channels)
+            return in_place(starting_locations(self.inducing, self.channels), self.order)
         return _points("locations", self.locations, self.channels)
 
     @property
@@ -161,6 +164,7 @@ class StaticPrior:
             values[f"{name}_constant"],
             values.get(f"{name}_slope"),
             name,
+            order=self.order,
         )
 
 

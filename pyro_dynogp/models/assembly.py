@@ -284,10 +284,10 @@ class _Assembler:
             gamma=torch.cat([gains.real, gains.imag], -2),
             m0=torch.zeros(self.states, dtype=torch.float64),
             P0=self.joint(self.covariances, 2),
-            G=torch.cat([b.rows for b in blocks], -2)
+            G=torch.cat([b.rows[..., list(b.order), :] for b in blocks], -2)
             if blocks
             else torch.zeros(0, self.total, dtype=torch.float64),
-            offset=torch.cat([self.expand(b.known, 2) for b in blocks], -1)
+            offset=torch.cat([self.expand(b.known[..., list(b.order)], 2) for b in blocks], -1)
             if blocks
             else torch.zeros(n, 0, dtype=torch.float64),
             H=H,

@@ -232,7 +232,7 @@ def draw_static(
     if isinstance(function, KnownFunction):
         mean, variance = function.moments(x)
         return mean, mean, variance
-    support = support_points(function.locations, support_count)
+    support = support_points(function, support_count)
     if function.channels > 1:
 
         def at(part: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -117,7 +117,7 @@ def _drawn(block: Block, system: System, random: Randomness, switches: Switches)
         return block
     layer = next(w.layer for w in system.wires if w.name == function.name)
     assert isinstance(layer, Static)
-    support = support_points(function.locations, layer.support)
+    support = support_points(function, layer.support)
     return replace(block, function=function.drawn(random.residual[function.name], support))
 
 

@@ -45,6 +45,12 @@ class Block:
         """Outputs of the function."""
         return self.channels if self.function is None else self.function.outputs
 
+    @property
+    def order(self) -> Sequence[int]:
+        """Places of its inputs as the filter has them: quadrature goes channel by channel."""
+        order = self.function.order if isinstance(self.function, StaticFunction) else None
+        return range(self.channels) if order is None else order
+
 
 def functions_of(blocks: Sequence[Block]) -> tuple[list[int], dict[str, Tensor]]:
     """Form of each static function, and the tensors that `Values` keeps of it."""
@@ -147,11 +153,13 @@ def _function(block: Block, M: int, widest: int) -> tuple[int, dict[str, Tensor]
     pad = torch.nn.functional.pad
     count = weight.shape[-1]
     values["weight"] = pad(weight, (0, M - count))
-    values["Z"] = pad(function.locations, (0, widest - d, 0, M - count)).unsqueeze(-3)
-    values["inverse"] = pad(1.0 / lengthscale, (0, widest - d)).unsqueeze(-2)
+    order = list(block.order)
+    Z = function.locations[..., order]
+    values["Z"] = pad(Z, (0, widest - d, 0, M - count)).unsqueeze(-3)
+    values["inverse"] = pad(1.0 / lengthscale[..., order], (0, widest - d)).unsqueeze(-2)
     values["constant"] = function.constant
     if function.slope is not None:
-        values["slope"] = pad(function.slope, (0, widest - d))
+        values["slope"] = pad(function.slope[..., order], (0, widest - d))
     return KERNELS[name], values
 
 

@@ -178,4 +178,8 @@ def _with_columns(scaling: Scaling, late: list[int], n_u: int) -> Scaling:
         input_scale=more(scaling.input_scale, scaling.input_scale[late]),
         input_names=(*names[:n_u], *(f"change of {names[c]}" for c in late), *names[n_u:]),
         input_units=(*units[:n_u], *(units[c] for c in late), *units[n_u:]),
+        input_order=(
+            *(c if c < n_u else c + len(late) for c in scaling.input_order),
+            *range(n_u, n_u + len(late)),
+        ),
     )

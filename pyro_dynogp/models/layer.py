@@ -120,7 +120,8 @@ class Known:
     from it to other layers is shifted and scaled to mean zero and standard deviation one, for
     normal signals of the size of the training record and parameters in the middle of their priors.
     With `scaled` inputs and output, too, are standard deviations from the mean of the training
-    record. The gains of the layer that sees it take up its size and sign: leave them out of the parameters.
+    record. The gains of the layer that sees it take up its size and sign: leave them out of the
+    parameters.
 
     Args:
         function: torch, differentiable in the parameters and, in models whose trajectories are not

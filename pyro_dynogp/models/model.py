@@ -95,7 +95,7 @@ class Model(Structure):
             elif isinstance(w.layer, Known):
                 yield from known_sites(w.name, w.layer)
             else:
-                yield from self.static_prior(w, w.layer).sites(w.dims)
+                yield from self.static_prior(w, w.layer, scaling).sites(w.dims)
                 if self._has_residual(w):
                     zero = torch.zeros(w.layer.outputs, w.layer.support, dtype=torch.float64)
                     prior = dist.Normal(zero, zero + 1.0).to_event(2)
@@ -107,7 +107,10 @@ class Model(Structure):
             zero = torch.zeros(self.outputs, dtype=torch.float64)
             prior = dist.Normal(zero, zero + (FLAT if flat else time_scale.brevity)).to_event(1)
             yield Site("offset", prior, ("output",))
-        yield from self.likelihood.sites(self.outputs, self.inputs - self.direct, flat=flat)
+        driving = self.inputs - self.direct
+        order = tuple(u for u in scaling.input_order if u < driving)
+        order = scaling.output_order if self.likelihood.follows_output else order
+        yield from self.likelihood.sites(self.outputs, driving, flat=flat, order=order)
         if self.late:
             yield delay_site(self.late, scaling)
 
@@ -176,9 +179,9 @@ class Model(Structure):
 
         Args:
             place, layer: which one. values: of its sites.
-            scaling: of the training record, by default the model's; for a layer with limits.
+            scaling: of the training record, by default the model's.
         """
-        function = self.static_prior(place, layer).function(values)
+        function = self.static_prior(place, layer, scaling).function(values)
         if layer.limits is None:
             return function
         return replace(function, limits=scaled_limits(layer.limits, scaling or self.scaling))
@@ -189,7 +192,7 @@ class Model(Structure):
         function = self.static_function(place, layer, values, scaling)
         if not self._has_residual(place):
             return StaticSystem(function)
-        support = support_points(function.locations, layer.support)
+        support = support_points(function, layer.support)
         return StaticSystem(function, support, values[f"{place.name}_residual"])
 
     def _modes_prior(self, place: Wire, layer: Dynamic, scaling: Scaling) -> ModesPrior:
@@ -211,8 +214,9 @@ class Model(Structure):
             reference=self.reference_of(layer, scaling),
         )
 
-    @staticmethod
-    def static_prior(place: Wire, layer: Static) -> StaticPrior:
+    def static_prior(
+        self, place: Wire, layer: Static, scaling: Scaling | None = None
+    ) -> StaticPrior:
         """Prior of the function of a static layer."""
         return StaticPrior(
             place.name,
@@ -223,6 +227,7 @@ class Model(Structure):
             mean=layer.mean or "constant",
             learn_locations=layer.learn_locations,
             smoothness=layer.smoothness,
+            order=self.order_of(place, scaling or self.scaling),
         )
 
     def _has_residual(self, place: Wire) -> bool:

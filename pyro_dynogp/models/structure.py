@@ -138,6 +138,28 @@ class Structure:
         """
         return scaling.reference_output if layer.outputs == self.outputs else 0
 
+    def order_of(self, place: Wire, scaling: Scaling | None) -> tuple[int, ...] | None:
+        """Places of a layer's channels in an order that does not depend on the record's.
+
+        Source by source: inputs and what is as many as outputs by how smooth the record's are,
+        others as they come. None for a single channel, and without a scaling.
+        """
+        if scaling is None or place.channels < 2:
+            return None
+        widths = {name: n for w in self.wires for name, n in w.signals.items()}
+        widths[INPUTS] = self.inputs - self.direct
+        order: list[int] = []
+        for source in place.sources:
+            known = self.order_of_signals(widths[source], scaling)
+            if source == INPUTS:
+                known = tuple(u for u in scaling.input_order if u < widths[INPUTS])
+            order += [len(order) + channel for channel in known]
+        return tuple(order)
+
+    def order_of_signals(self, count: int, scaling: Scaling) -> tuple[int, ...]:
+        """Places of so many signals: as the record's outputs, where they are as many."""
+        return scaling.output_order if count == self.outputs else tuple(range(count))
+
     @property
     def is_linear(self) -> bool:
         """Whether it is one layer of linear dynamics, whatever the noise."""

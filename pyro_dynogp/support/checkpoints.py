@@ -12,8 +12,6 @@ import errno
 import json
 import os
 import re
-import secrets
-import socket
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,12 +24,11 @@ from torch import Tensor
 
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.identity import digest, versions
+from pyro_dynogp.support.writing import HOST, write_whole
 
 Piece = dict[str, Tensor]
 # Of a file's texts, the one that is the digest of all else in it.
 DIGEST = "pyro_dynogp.sha256"
-# This machine, in the names of files that are being written.
-HOST = re.sub(r"\W", "_", socket.gethostname())
 
 
 @dataclass(frozen=True)
@@ -67,7 +64,7 @@ class Checkpoints:
                 if not _lives(int(stale.name.split("-")[-2])):
                     stale.unlink(missing_ok=True)
             if not note.exists():  # of two that begin here at once one makes it, both read it
-                _write(note, lambda p: p.write_text(text), replace=False)
+                write_whole(note, lambda p: p.write_text(text), replace=False)
         found = _read_note(note)
         if found["fingerprint"] != fingerprint:
             theirs = found.get("parts", {})
@@ -109,11 +106,10 @@ def _told(folder: Path) -> Iterator[None]:
     """Say in a sentence that a folder cannot be written to."""
     try:
         yield
-    except (OSError, SafetensorError) as error:
-        why = getattr(error, "strerror", None) or error
-        number = getattr(error, "errno", None) or errno.EIO
+    except OSError as error:
+        why = error.strerror or error
         raise OSError(
-            number,
+            error.errno or errno.EIO,
             f"checkpoint: {folder} cannot be written to ({why}). What was finished before is kept "
             "there: the same call goes on from it once there is room and leave to write",
         ) from error
@@ -142,39 +138,24 @@ def _lives(process: int) -> bool:
     return True
 
 
-def _write(path: Path, writer: Callable[[Path], object], *, replace: bool = True) -> None:
-    """Write a file that is there whole or not at all, readable to whom the user's mask says.
-
-    Args:
-        path: of the file. writer: is called with the path of a file to write.
-        replace: whether to replace a file that is there, or to leave it as it is.
-    """
-    part = path.with_name(f"{path.name}.{HOST}-{os.getpid()}-{secrets.token_hex(4)}.part")
-    try:
-        with open(part, "xb"):  # made here, so that its mode is what the user's mask says
-            mode = part.stat().st_mode
-        writer(part)
-        part.chmod(mode)  # a writer may have made the file anew
-        with open(part, "rb") as file:
-            os.fsync(file.fileno())
-        if replace:
-            part.replace(path)
-        else:
-            with contextlib.suppress(FileExistsError):
-                os.link(part, path)
-    finally:
-        part.unlink(missing_ok=True)
-
-
 def write_tensors(path: Path, tensors: Piece, texts: Mapping[str, str]) -> Piece:
     """Write a safetensors file with a digest of all that is in it, whole or not at all.
 
     Returns:
         The tensors as they are in it, which share no memory with what was given.
+
+    Raises:
+        OSError: where it cannot be written; what was there before is there.
     """
     apart = {name: value.detach().clone().contiguous() for name, value in tensors.items()}
     marked = {**texts, DIGEST: content_digest(apart, texts)}
-    _write(path, lambda part: save_file(apart, str(part), metadata=marked))
+    try:
+        write_whole(path, lambda part: save_file(apart, str(part), metadata=marked))
+    except SafetensorError as error:  # which has the system's number in its text alone
+        number = re.search(r"os error (\d+)", str(error))
+        if number is None:
+            raise OSError(errno.EIO, str(error)) from error
+        raise OSError(int(number[1]), os.strerror(int(number[1]))) from error
     return apart
 
 

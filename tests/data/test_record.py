@@ -369,7 +369,7 @@ class TestChannels:
         assert "level" in record.extra
 
     def test_select_refuses(self):
-        with refused("select", "['flow', 'heat', 'level', 'rain']", "'wind'"):
+        with refused("inputs", "['flow', 'heat', 'level', 'rain']", "'wind'"):
             example().select(inputs=["wind"])
         with refused("names", "'level' 2 times"):
             example().select(inputs=["level"])
@@ -517,3 +517,22 @@ class TestSequences:
     def test_mismatch_is_named(self, field, value):
         with refused(f"records[1].{field}", "as in records[0]", str(value)):
             as_records([example(), example(**{field: value})])
+
+
+@pytest.mark.parametrize(
+    "cells",
+    [
+        np.array([1.0, None, 3.0], dtype=object),
+        pd.array([1, None, 3], dtype="Int64"),
+        pd.array([1.0, None, 3.0], dtype="Float64"),
+        np.ma.array([1.0, 2.0, 3.0], mask=[False, True, False]),
+        [1.0, None, 3.0],
+    ],
+    ids=["object", "Int64", "Float64", "masked", "list"],
+)
+def test_a_missing_cell_is_missing_in_whatever_it_comes(cells):
+    """Of an output; an input has to be known."""
+    record = Record([0.0, 1.0, 2.0], [1.0, 2.0, 4.0], cells)
+    np.testing.assert_array_equal(record.outputs[:, 0], [1.0, np.nan, 3.0])
+    with refused("inputs", "finite numbers", "nan", "rows: 1"):
+        Record([0.0, 1.0, 2.0], cells, [1.0, 2.0, 4.0])

@@ -85,9 +85,20 @@ def test_constant_output(size):
 
 def test_constant_up_to_rounding():
     wiggle = 1e6 + 1e-9 * np.arange(5)
-    with refused("output 'y'", "varies"):
+    with refused("output 'y'", "varies", "differ by rounding alone", "less the level"):
         Scaling.from_records(example(outputs=wiggle))
     assert Scaling.from_records(example(outputs=wiggle - 1e6)).output_scale[0] > 0
+
+
+@pytest.mark.parametrize("size", [1e-310, 1e-200, 1e160, 1e300])
+@pytest.mark.parametrize("role", ["inputs", "outputs"])
+def test_numbers_whose_squares_are_none(role, size):
+    """They are no constants, and what is made of them has no variance, or an infinite one."""
+    wave = size * np.sin(np.arange(5.0))
+    signal = {"inputs": np.column_stack([np.arange(5), wave]), "outputs": wave}[role]
+    name = {"inputs": "input 'b'", "outputs": "output 'y'"}[role]
+    with refused(name, "numbers of a size between 1e-100 and 1e+100", "another unit"):
+        Scaling.from_records(example(**{role: signal}))
 
 
 def test_constant_input():

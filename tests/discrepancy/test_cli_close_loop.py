@@ -1,6 +1,9 @@
 """The command close-loop: what it reads, hands on, prints and writes."""
 
 import json
+import re
+import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -182,3 +185,26 @@ def test_help_has_examples():
     assert result.exit_code == 0
     assert "Examples:\n    pyro-dynogp close-loop " in result.stdout
     assert max(map(len, result.stdout.splitlines())) <= 100
+
+
+def test_a_report_that_cannot_be_written_is_written_elsewhere(folder, tmp_path, seen, monkeypatch):
+    """A disk that fills during the search, which may have taken hours."""
+    out, whole = tmp_path / "out", Path.replace
+
+    def full(part, target):
+        if Path(target).parent == out:
+            raise OSError(28, "No space left on device")
+        return whole(part, target)
+
+    monkeypatch.setattr(Path, "replace", full)
+    result = run(folder / "plant.csv", *COLUMNS, *QUICK, "--out", out)
+    assert result.exit_code == 0, result.output
+    assert list(out.iterdir()) == []
+    assert result.stderr.count("Saved elsewhere: move ") == 3
+    said = re.search(r"Report: (\S+) \(numbers: (\S+)\)\nModel:  (\S+) ", result.stdout)
+    page, numbers, model = map(Path, said.groups())
+    assert page.read_text().startswith("<!DOCTYPE html>")
+    assert "effects" in json.loads(numbers.read_text())
+    assert dgp.load(model).method
+    for path in (page, numbers, model):
+        shutil.rmtree(path.parent)

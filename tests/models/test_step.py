@@ -39,8 +39,8 @@ def test_free_runs_are_those_of_a_plain_simulation(sees, hidden):
     weights = weights / weights.sum()
     typical = np.tanh(nodes / np.exp(-2.0))  # in the middle of the priors
     size = np.sqrt(weights @ typical**2)
-    lam, B, C = (np.concatenate([x, x.conj()], axis) for x, axis in
-                 ((modes.poles.numpy(), 0), (modes.B.numpy(), 0), (modes.C.numpy(), -1)))  # fmt: skip
+    lam, B = (np.concatenate([x, x.conj()]) for x in (modes.poles.numpy(), modes.B.numpy()))
+    C = np.concatenate([modes.C.numpy(), modes.C.numpy().conj()], -1)
     first = system.layer("g").first_state.numpy()
     x = np.concatenate([first, first.conj()])
     u = (record.inputs[:, 0] - scaling.input_offset) / scaling.input_scale

@@ -31,6 +31,16 @@ class World:
         return wiener_record(n=60, **units)
 
     @functools.cached_property
+    def frame(self):
+        return self.record.to_frame()
+
+    @functools.cached_property
+    def table(self):
+        path = tempfile.mkdtemp() + "/table.csv"
+        self.frame.to_csv(path)
+        return path
+
+    @functools.cached_property
     def blank(self):
         return self.record.with_outputs(np.zeros((60, 0)), names=())
 
@@ -128,6 +138,26 @@ RUN = {"seed": SEED, "workers": COUNT, "progress": SWITCH}
 SAMPLES = {"samples": COUNT, "seed": SEED}
 VARIATIONAL = {"draws": COUNT, "particles": COUNT, "learning_rate": POSITIVE}
 
+NAMES = (3, 1.5, True, b"valve", {"valve": 1}, ["absent"], [3], [None], object(), np.zeros(2))
+TEXT = (3, True, b"text", ["time"], {"a": 1}, object())
+UNITS = (3, True, b"V", {"V": 1}, ["a", "b", "c"], [3])
+FRAMES = (None, 3, "text", b"frame", {"valve": [1.0]}, [1.0], np.zeros(3), [], dict)
+COLUMNS = {"inputs": "valve", "outputs": ["y"]}
+READ = {
+    "inputs": NAMES,
+    "outputs": NAMES,
+    "output": ("y", *NAMES),
+    "time": ("absent", *TEXT),
+    "sampling_time": (*POSITIVE, True),
+    "timezone": TEXT,
+    "time_unit": TEXT,
+    "extra": NAMES,
+    "input_units": UNITS,
+    "output_units": UNITS,
+    "extra_units": (3, True, "V", b"V", ["V"], {"absent": "V"}, {3: "V"}),
+    "name": TEXT,
+}
+
 
 def foreign(world):
     return [*RECORD, *world.others]
@@ -160,7 +190,8 @@ TABLE: dict[str, Entry] = {
     "WienerHammerstein": plain(dgp.WienerHammerstein, {**CURVED, "width": COUNT}, inputs=1,
                                pairs=1),
     "HammersteinWiener": plain(dgp.HammersteinWiener, CURVED, inputs=1, pairs=1),
-    "NonlinearFeedback": plain(dgp.NonlinearFeedback, {**CURVED, "hidden": NUMBER}, inputs=1),
+    "NonlinearFeedback": plain(dgp.NonlinearFeedback, {**CURVED, "hidden": NUMBER,
+                                "step": ("yes", 2, 0.5, [True])}, inputs=1),
     "ParallelWienerHammerstein": plain(dgp.ParallelWienerHammerstein,
                                        {**CURVED, "branches": (*COUNT, None)}, inputs=1, pairs=1),
     "Cascade": plain(dgp.Cascade, {"inputs": NUMBER, "layers": ((), ["g"], [3], "g", None),
@@ -183,8 +214,10 @@ TABLE: dict[str, Entry] = {
         "support": COUNT, "name": ("y", 3), "smoothness": (1, 2.0, None, "rbf", np.nan, [1.5])}),
     "Known": plain(of_model(dgp.Known, function=torch.sqrt), {
         "function": (3, None, "text"), "parameters": (3, {"a": 3}, {3: None}), "outputs": COUNT,
-        "range": ((1.0, 0.0), 3, "text", (0.0, np.nan)), "skip": (("x",), 3),
+        "range": ((1.0, 0.0), 3, "text", (0.0, np.nan)), "scaled": SWITCH, "skip": (("x",), 3),
         "sees": (("x",), 3), "name": ("y", 3)}),
+    "Step": plain(of_model(dgp.Step), {"skip": (("x",), 3), "sees": (("x",), 3),
+                                       "name": ("y", 3)}),
     "Gaussian": plain(dgp.Gaussian, {}),
     "StudentT": plain(dgp.StudentT, {"degrees_of_freedom": (0, -1.0, np.nan, np.inf, "a", None)}),
     "Heteroscedastic": plain(dgp.Heteroscedastic, {"inducing": COUNT, "of": NAME}),
@@ -211,6 +244,26 @@ TABLE: dict[str, Entry] = {
         "extra": ({"a": [1.0]}, {3: [1.0, 2.0, 3.0]}, {"a": "text"}, {"y": [1.0, 2.0, 3.0]}, 3),
         "extra_units": ({"a": "m"}, 3)}, free=("name",),
         time=[0.0, 1.0, 2.0], inputs=[1.0, 2.0, 4.0], outputs=[0.0, 1.0, 2.0]),
+    "Record.from_frame": Entry(lambda w: w.record.from_frame, lambda w: {**COLUMNS,
+        "frame": w.frame}, {"frame": FRAMES, **READ}),
+    "Record.from_xarray": Entry(lambda w: w.record.from_xarray, lambda w: {**COLUMNS,
+        "dataset": w.record.to_xarray()}, {"dataset": FRAMES, **READ}),
+    "Record.from_csv": Entry(lambda w: w.record.from_csv, lambda w: {**COLUMNS, "path": w.table,
+        "time": "time"}, {"path": (None, 3, "/absent", "/proc", [1]), **READ, "header": SWITCH[:2],
+        "names": (3, 1.5, b"a", {"a": 1}, [3]), "delimiter": (3, b";", [";"]), "decimal": (3, "x"),
+        "encoding": (3, b"utf-8")}),
+    "Record.select": Entry(lambda w: w.record.select, lambda w: {},
+        {"inputs": (3, 1.5, True, b"valve", {"valve": 1}, ["absent"], [3], object()),
+         "outputs": (3, 1.5, True, b"y", {"y": 1}, ["absent"], [3], object())}),
+    "Record.with_extra_as_input": Entry(
+        lambda w: dataclasses.replace(w.record, extra={"rain": np.ones(60)}).with_extra_as_input,
+        lambda w: {"name": "rain"}, {"name": ("absent", "y", 3, None, ["rain"], b"rain")}),
+    "Record.split": Entry(lambda w: w.record.split, lambda w: {"at": 30},
+        {"at": (0, -1, 60, 0.5, None, True, "2020-01-01", [3])}),
+    "Record.with_outputs": Entry(lambda w: w.record.with_outputs,
+        lambda w: {"outputs": w.record.outputs},
+        {"outputs": (*ARRAY, [1.0], None), "names": (3, True, b"y", {"y": 1}, ["a", "b"], [3]),
+         "units": (3, True, b"m", {"m": 1}, ["a", "b"], [3])}),
     "Scaling": Entry(lambda w: dgp.Scaling.from_records, lambda w: {"records": w.record},
                      {"records": RECORD}),
     "Prediction": Entry(lambda w: w.prediction.quantile, lambda w: {"q": 0.5},

@@ -21,7 +21,10 @@ from pyro_dynogp.inference.optimise.descent import polished
 from pyro_dynogp.inference.optimise.lengths import Lengths
 from pyro_dynogp.inference.starts.linear import linear_starts, one_output
 from pyro_dynogp.inference.starts.static import smoothest_first
+from pyro_dynogp.layers.functions import StaticFunction, support_points
+from pyro_dynogp.layers.kernels import KernelPrior
 from pyro_dynogp.models.gauge import in_gauge, usual_length
+from pyro_dynogp.models.system import DynamicSystem
 from tests.conftest import simulate_record
 
 SAME = 1e-6
@@ -58,6 +61,9 @@ def first_bent():
 class Kind:
     """A model, its record, how it is fitted, which channels change places, and what is the same.
 
+    Forecasts of functions of several outputs are drawn, and random numbers go by place: such kinds
+    are compared `one_step` ahead, where nothing is drawn. `units`: whether units change, too.
+
     Process noise that vanishes has a logarithm without a mode: where a climb stops for lack of
     slope, what is left of it is as small as that, not as rounding. Such kinds have a `tolerance`.
     """
@@ -68,6 +74,8 @@ class Kind:
     outputs: bool = False
     inputs: bool = True
     tolerance: float = SAME
+    one_step: bool = False
+    units: bool = True
 
 
 MODE = {"method": "map"}
@@ -79,12 +87,40 @@ KINDS = {
     "linear, draws": Kind(first_output, lambda: LINEAR(2, pairs=1), {"restarts": 3}, inputs=False),
     "linear, two outputs": Kind(plant, lambda: LINEAR(2, outputs=2, pairs=1), MODE, outputs=True),
     "Wiener": Kind(first_bent, lambda: dgp.Wiener(2, pairs=1, inducing=5), SHORT),
-    "Wiener, two outputs": Kind(bent, lambda: dgp.Wiener(2, outputs=2, pairs=1, inducing=5), SHORT),
+    "Wiener, two outputs": Kind(
+        bent,
+        lambda: dgp.Wiener(2, outputs=2, pairs=1, inducing=5),
+        SHORT,
+        outputs=True,
+        one_step=True,
+    ),
     "Wiener-Hammerstein": Kind(
         first_bent, lambda: dgp.WienerHammerstein(2, pairs=1, inducing=5), SHORT
     ),
-    "Hammerstein": Kind(
-        first_bent, lambda: dgp.Hammerstein(2, pairs=1, inducing=5), SHORT, inputs=False
+    "Wiener-Hammerstein, two outputs": Kind(
+        bent,
+        lambda: dgp.WienerHammerstein(2, outputs=2, pairs=1, inducing=5),
+        SHORT,
+        outputs=True,
+        units=False,
+    ),
+    "Hammerstein": Kind(first_bent, lambda: dgp.Hammerstein(2, pairs=1, inducing=5), SHORT),
+    "Hammerstein-Wiener": Kind(
+        first_bent, lambda: dgp.HammersteinWiener(2, pairs=1, inducing=5), SHORT, units=False
+    ),
+    "Hammerstein, fixed locations": Kind(
+        first_bent,
+        lambda: dgp.Cascade(
+            2, [dgp.Static(outputs=1, inducing=5, learn_locations=False), dgp.Dynamic(pairs=1)]
+        ),
+        SHORT,
+        units=False,
+    ),
+    "noise by the inputs": Kind(
+        first_output,
+        lambda: LINEAR(2, pairs=1, likelihood=dgp.Heteroscedastic(inducing=4)),
+        SHORT,
+        units=False,
     ),
     "Student's t": Kind(
         first_output,
@@ -108,10 +144,16 @@ class Told:
 
 def told(kind, record, units=(1.0, 1.0), outputs=None):
     fit = dgp.fit(kind.model(), record[:TRAIN], **kind.options, **QUICK)
-    forecast = fit.forecast(record[:TRAIN], record[TRAIN:], samples=20)
+    if kind.one_step:
+        forecast = fit.predict(record)
+    else:
+        forecast = fit.forecast(record[:TRAIN], record[TRAIN:], samples=20)
     units = np.array(units[: record.n_outputs])
     places = slice(None) if outputs is None else outputs
-    noise = fit.mode["noise_sd"].numpy()
+    if "noise_sd" in fit.mode:
+        noise = fit.mode["noise_sd"].numpy()
+    else:
+        noise = fit.mode["log_noise_constant"].exp().numpy()
     log_p = -float(fit.start_energies[0]) + TRAIN * float(np.log(units).sum())
     return Told(
         fit, (forecast.mean / units)[:, places], (forecast.sd / units)[:, places],
@@ -151,6 +193,7 @@ def same_sites(one, other):
 UNITS = [
     (kind, channel, factor)
     for kind, one in KINDS.items()
+    if one.units
     for channel in (("u", "y", "z") if one.record in (plant, bent) else ("u", "y"))
     for factor in ((1000.0, 0.001) if channel != "u" else (1000.0,))
 ]
@@ -187,8 +230,23 @@ def test_order_of_outputs(kind, first):
     record = KINDS[kind].record().select(outputs=["z", "y"])
     other = told(KINDS[kind], record, outputs=[1, 0])
     same(first(kind), other)
-    poles = [one.fit.modes.poles.numpy() for one in (first(kind), other)]
-    np.testing.assert_allclose(poles[1], poles[0], rtol=SAME)
+    for a, b in zip(first(kind).fit.system.layers, other.fit.system.layers, strict=True):
+        if isinstance(a, DynamicSystem):
+            np.testing.assert_allclose(b.modes.poles.numpy(), a.modes.poles.numpy(), rtol=SAME)
+
+
+@pytest.mark.parametrize("channel", ["u", "y"])
+def test_a_level_far_above_what_varies(channel, first):
+    """A million and some tenths: the first six digits say nothing."""
+    record = KINDS["linear"].record()
+    inputs, outputs = record.inputs.copy(), record.outputs.copy()
+    (inputs if channel == "u" else outputs)[:, 0] += 1e6
+    names: dict[str, Any] = {
+        "input_names": record.input_names, "output_names": record.output_names,
+    }  # fmt: skip
+    other = told(KINDS["linear"], dgp.Record(record.time, inputs, outputs, **names))
+    level = 1e6 if channel == "y" else 0.0
+    same(first("linear"), dataclasses.replace(other, mean=other.mean - level))
 
 
 @pytest.mark.parametrize("change", ["inputs", "outputs", "units"])
@@ -335,6 +393,52 @@ class TestStarts:
         for start in linear_starts(problem.target, problem.records, 6, 0):
             one, two = start["g_noise_gain_unit"].unbind(1)
             assert bool(((one - two).abs() > 0.5 * torch.minimum(one, two)).all())
+
+    def test_orders_do_not_depend_on_how_channels_are_given(self):
+        r = plant()
+        orders = [
+            Scaling.from_records(r.select(inputs=u, outputs=y))
+            for u in (["u", "v"], ["v", "u"])
+            for y in (["y", "z"], ["z", "y"])
+        ]
+        inputs = {tuple(s.input_names[k] for k in s.input_order) for s in orders}
+        outputs = {tuple(s.output_names[k] for k in s.output_order) for s in orders}
+        changes = np.square(np.diff(r.inputs / r.inputs.std(0), axis=0)).mean(0)
+        assert inputs == {("u", "v") if changes[0] < changes[1] else ("v", "u")}
+        assert outputs == {("y", "z")}
+
+    def test_channels_that_change_alike_go_by_when_they_are_large(self):
+        """Two switched signals of one number of switches: as smooth, and not the same."""
+        early, late = np.zeros(40), np.zeros(40)
+        early[5:15], late[25:35] = 1.0, 1.0
+        t, y = np.arange(40.0), np.sin(np.arange(40.0))
+        for columns, expected in ((np.c_[early, late], (0, 1)), (np.c_[late, 1e3 * early], (1, 0))):
+            assert Scaling.from_records(dgp.Record(t, columns, y)).input_order == expected
+
+    @pytest.mark.parametrize("order", [(0, 0), (0, 2), (1,), (0, 1, 2), (True, 0), (0.5, 1)])
+    def test_an_order_that_there_is_not_is_refused(self, order):
+        with pytest.raises(ValueError, match="input_order: expected"):
+            dataclasses.replace(Scaling.from_records(plant()), input_order=order)
+
+    def test_files_of_before_had_channels_as_they_were_given(self):
+        plain = Scaling.from_records(plant().select(outputs=["z", "y"])).to_dict()
+        assert Scaling.from_dict(plain).output_order == (1, 0)
+        del plain["input_order"], plain["output_order"]
+        assert Scaling.from_dict(plain).output_order == (0, 1)
+
+    def test_support_points_go_with_the_channels(self):
+        """Those of a function whose channels change places are the same points."""
+        z = torch.randn(6, 2, dtype=torch.float64)
+        one = torch.ones(1, dtype=torch.float64)
+
+        def points(z, order):
+            kernel = KernelPrior("f", None, 2).sampled({"f_lengthscale": one.expand(2)})
+            values = torch.zeros(1, 6, dtype=torch.float64)
+            f = StaticFunction(kernel, z, values, one, one, order=order)
+            return support_points(f, 7)
+
+        torch.testing.assert_close(points(z[:, [1, 0]], (1, 0))[:, [1, 0]], points(z, (0, 1)))
+        assert not torch.equal(points(z[:, [1, 0]], None)[:, [1, 0]], points(z, None))
 
     def test_channels_by_smoothness(self):
         x = torch.randn(100, 3, dtype=torch.float64)

@@ -11,6 +11,7 @@ from torch.nn.functional import pad
 
 from pyro_dynogp.data.scaling import Scaling, TimeScale
 from pyro_dynogp.inference.starts.poles import WALKS, random_poles
+from pyro_dynogp.layers.functions import in_place
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.models.wiring import Dynamic, Known, Wire
@@ -48,6 +49,22 @@ class DynamicStart:
 
     def _random(self, *shape: int, scale: float = SMALL) -> Tensor:
         return torch.tensor(scale * self.generator.standard_normal(shape), dtype=torch.float64)
+
+    @property
+    def _inputs(self) -> tuple[int, ...]:
+        """Places of what a layer sees and what comes back: the same whatever the record's order."""
+        model, d = self.model, self.one.channels
+        order = list(model.order_of(self.one, self.scaling) or range(d))
+        widths = {wire.name: wire.layer.outputs for wire in model.wires}
+        for name in self.one.feedback:
+            order += [len(order) + i for i in model.order_of_signals(widths[name], self.scaling)]
+        return tuple(order)
+
+    @property
+    def _signals(self) -> tuple[int, ...]:
+        """Places of the layer's signals, likewise."""
+        order = self.model.order_of_signals(self.layer.outputs, self.scaling)
+        return (*order, *range(self.layer.outputs, self.layer.width))
 
     def from_linear(
         self, linear: Mapping[str, Tensor], moved: bool = False, ahead: bool = True
@@ -121,12 +138,19 @@ class DynamicStart:
         wires = {wire.name: wire for wire in self.model.wires}
         sign = float(self.generator.choice([-1.0, 1.0]))
         like = gain.mean(1, keepdim=True) if gain.shape[1] else gain.new_ones(len(gain), 1, 2)
-        back = []
-        for name in self.one.feedback:
-            layer = wires[name].layer
-            own = self._random(len(gain), layer.outputs, 2)
-            back.append(own if isinstance(layer, Known) else 0.5 * sign * like + own)
-        return torch.cat([gain, *back], 1)
+        layers = (wires[name].layer for name in self.one.feedback)
+        share = [
+            0.0 if isinstance(layer, Known) else 0.5 * sign
+            for layer in layers
+            for _ in range(layer.outputs)
+        ]
+        own = self._back(len(gain), self.one.fed, 2)
+        return torch.cat([gain, gain.new_tensor(share)[:, None] * like + own], 1)
+
+    def _back(self, pairs: int, fed: int, parts: int) -> Tensor:
+        """Small numbers (P, fed, 2) at random, each for its channel wherever that is."""
+        own = [place - self.one.channels for place in self._inputs[self.one.channels :]]
+        return in_place(self._random(pairs, fed, parts).mT, own).mT
 
     def near_identity(self) -> Values:
         """Each output is an input, beside small random dynamics."""
@@ -139,20 +163,25 @@ class DynamicStart:
             self._key("log_frequency"): torch.tensor(np.log(poles.imag / rate)),
         }
         if d + self.one.fed:
-            values[self._key("input_gain")] = self._random(P, d + self.one.fed, 2)
+            gain = self._random(P, d + self.one.fed, 2)
         if d:
             shape = self._direct_shape()
             if shape is not None:
                 D = torch.eye(layer.width, shape[-1], dtype=torch.float64)
                 D = D + self._random(layer.width, shape[-1])
+                D = in_place(in_place(D, self._inputs[: shape[-1]]).mT, self._signals).mT
                 values[self._key("feedthrough")] = D if several else D[0]
             else:  # the fastest pair passes the first input on
                 fastest = int(np.argmax(np.abs(poles)))
-                values[self._key("input_gain")][fastest, 0, 1] = 1.0
+                gain[fastest, 0, 1] = 1.0
+        if d + self.one.fed:
+            values[self._key("input_gain")] = in_place(gain.mT, self._inputs).mT
         if several:
             gain = self._random(layer.width, P, 2, scale=0.7)
             gain[0] = gain[0] + torch.tensor([1.0, 0.0], dtype=torch.float64)
-            values[self._key("output_gain")] = gain
+            values[self._key("output_gain")] = in_place(gain.movedim(0, -1), self._signals).movedim(
+                -1, 0
+            )
         if layer.process_noise:
             values.update(self._small_noise())
         return values
