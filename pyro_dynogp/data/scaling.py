@@ -39,6 +39,13 @@ class Scaling:
         time_unit: unit of time.
         reference_output: place of the smoothest output, by which the phases of modes are told: the
             same one in whatever order and units the outputs are given.
+
+    Examples:
+        >>> record = dgp.datasets.load("gas_furnace").train[:60]
+        >>> scaling = dgp.Scaling.from_records(record)
+        >>> scaled = (record.outputs - scaling.output_offset) / scaling.output_scale
+        >>> round(float(scaled.std()), 9)
+        1.0
     """
 
     time_step: float
@@ -192,6 +199,11 @@ class TimeScale:
     Attributes:
         step: median sampling step [s].
         duration: length of the record [s].
+
+    Examples:
+        >>> low, high = dgp.TimeScale(step=0.1, duration=100.0).rate_bounds
+        >>> low < high
+        True
     """
 
     step: float
