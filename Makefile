@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 WORKERS ?= 2
 
-TUTORIALS := $(patsubst notebooks/%.ipynb,build/tutorials/%.ipynb,$(wildcard notebooks/*.ipynb))
+TUTORIALS := $(patsubst notebooks/%.ipynb,build/tutorials/%.md,$(wildcard notebooks/*.ipynb))
 
 .PHONY: demo test docs notebooks package benchmark clean
 .DELETE_ON_ERROR:
@@ -27,9 +27,9 @@ docs: $(TUTORIALS)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
 # Notebooks are executed before the site is built, and only those that changed.
-build/tutorials/%.ipynb: notebooks/%.ipynb $(VENV)/docs
+build/tutorials/%.md: notebooks/%.ipynb $(VENV)/docs
 	mkdir -p $(@D)
-	$(BIN)/python -m nbconvert --to notebook --execute --ExecutePreprocessor.timeout=1200 \
+	$(BIN)/python -m nbconvert --to markdown --execute --ExecutePreprocessor.timeout=1200 \
 		--output-dir $(@D) $<
 
 notebooks: $(VENV)/notebooks

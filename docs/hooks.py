@@ -16,17 +16,19 @@ OUTSIDE = {
     "contributing.md": "CONTRIBUTING.md",
     "changes.md": "CHANGELOG.md",
 }
+# Pages whose tables need the whole width.
+WIDE = ("comparison.md", "deep_models.md", "planted.md", "paper.md")
 TUTORIALS = ROOT / "build" / "tutorials"
 
 
 def on_files(files: Files, config) -> Files:
-    """Add README, CONTRIBUTING, CHANGELOG, and the notebooks with their outputs."""
+    """Add README, CONTRIBUTING, CHANGELOG, and the notebooks as nbconvert has executed them."""
     for page, source in OUTSIDE.items():
         content = for_site((ROOT / source).read_text())
         files.append(File.generated(config, page, content=content))
-    for notebook in sorted(TUTORIALS.glob("*.ipynb")):
-        page = f"tutorials/{notebook.name}"
-        files.append(File.generated(config, page, abs_src_path=str(notebook)))
+    for path in sorted(p for p in TUTORIALS.rglob("*") if p.is_file()):
+        page = f"tutorials/{path.relative_to(TUTORIALS).as_posix()}"
+        files.append(File.generated(config, page, abs_src_path=str(path)))
     return files
 
 
@@ -34,12 +36,14 @@ def for_site(text: str) -> str:
     """Links of a file at the root of the repository, as the site has them."""
     text = re.sub(r"\]\(docs/", "](", text)
     for page, source in OUTSIDE.items():
-        text = text.replace(f"]({source})", f"]({page})")
+        text = re.sub(rf"\]\({re.escape(source)}(#[^)]*)?\)", rf"]({page}\1)", text)
     return text
 
 
 def on_page_markdown(markdown: str, page, **_: object) -> str:
-    """Links from pages of this folder to files outside of it."""
+    """Links from pages of this folder to files outside of it; room for wide tables."""
+    if page.file.src_uri in WIDE:
+        page.meta["hide"] = ["navigation", "toc"]
     for name, source in OUTSIDE.items():
         markdown = re.sub(rf"\]\(((?:\.\./)*)\.\./{re.escape(source)}\)", rf"](\1{name})", markdown)
     return markdown

@@ -26,15 +26,16 @@ def test_blocks_run(path, tmp_path, monkeypatch):
         pages.run(path)
 
 
-@pytest.mark.parametrize("path", pages.pages(), ids=lambda path: path.stem)
+OF_THE_ROOT = [pages.ROOT / "CONTRIBUTING.md", pages.ROOT / "CHANGELOG.md"]
+
+
+@pytest.mark.parametrize("path", [*pages.pages(), *OF_THE_ROOT], ids=lambda path: path.stem)
 def test_links_resolve(path):
     for target in pages.links(path):
         file, _, anchor = target.partition("#")
         there = (path.parent / file).resolve() if file else path
-        if there.suffix == ".md" and there.parent.name == "tutorials":
-            continue
-        if there.suffix == ".ipynb":  # tutorials are notebooks, copied when the site is built
-            there = pages.ROOT / "notebooks" / there.name
+        if there.parent == pages.DOCS / "tutorials":  # notebooks, executed for the site alone
+            there, anchor = pages.ROOT / "notebooks" / f"{there.stem}.ipynb", ""
         assert there.exists(), f"{path.name}: {target}"
         if anchor and not anchor.startswith("pyro_dynogp."):
             assert anchor in pages.anchors(there), f"{path.name}: {target}"
@@ -62,7 +63,7 @@ def test_the_navigation_is_whole():
     named = navigation()
     assert len(named) == len(set(named))
     markdown = {str(p.relative_to(pages.DOCS)) for p in pages.pages()[1:]}
-    tutorials = {f"tutorials/{p.name}" for p in (pages.ROOT / "notebooks").glob("*.ipynb")}
+    tutorials = {f"tutorials/{p.stem}.md" for p in (pages.ROOT / "notebooks").glob("*.ipynb")}
     outside = {"index.md", "contributing.md", "changes.md"}  # files of the root, see docs/hooks.py
     assert set(named) == markdown | tutorials | outside
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -31,9 +32,10 @@ for code in json.load(open("blocks.json")):
 
 
 def call(*command: str | Path, cwd: Path | None = None) -> str:
-    """Run a command; its output, also where it fails."""
+    """Run a command that sees no other Python; its output, also where it fails."""
+    clean = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     done = subprocess.run(
-        [str(part) for part in command], cwd=cwd, text=True,
+        [str(part) for part in command], cwd=cwd, text=True, env=clean,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
     )  # fmt: skip
     if done.returncode:
