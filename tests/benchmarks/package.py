@@ -30,6 +30,16 @@ for code in json.load(open("blocks.json")):
     exec(code, names)
 """
 
+CSV = """
+import pyro_dynogp as dgp
+dgp.datasets.load("gas_furnace").full.to_frame().to_csv("furnace.csv")
+"""
+COLUMNS = ("furnace.csv", "--input", "InputGasRate", "--output", "CO2", "--time", "time")
+SHELL = {
+    "from a CSV file to figures": ("fit", *COLUMNS, "--train", "200", "--figures", "figures"),
+    "from a CSV file to the page": ("close-loop", *COLUMNS, "--max-rounds", "1", "--out", "report"),
+}
+
 
 def call(*command: str | Path, cwd: Path | None = None) -> str:
     """Run a command that sees no other Python; its output, also where it fails."""
@@ -73,7 +83,11 @@ def run(folder: Path) -> str:
         command = there / "use" / "bin" / "pyro-dynogp"
         step("pyro-dynogp compile", command, "compile", "--quiet", cwd=there)
         step("blocks of the README", python, "use.py", pages.ROOT, cwd=there)
-        step("pyro-dynogp --help", command, "--help", cwd=there)
+        call(python, "-c", CSV, cwd=there)
+        for name, arguments in SHELL.items():
+            step(name, command, *arguments, "--pairs", "1", "--quiet", cwd=there)
+        assert any((there / "figures").glob("*.png"))
+        assert (there / "report" / "report.html").is_file()
         step("install mypy", python, *pip, *pins, "mypy", cwd=there)
         (there / "typed.py").write_text(TYPED)
         seen = step("types of the wheel", python, "-m", "mypy", "typed.py", cwd=there)
