@@ -4,7 +4,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 WORKERS ?= 2
 
-.PHONY: demo test benchmark clean
+TUTORIALS := $(patsubst notebooks/%.ipynb,build/tutorials/%.md,$(wildcard notebooks/*.ipynb))
+
+.PHONY: demo test docs notebooks package benchmark clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed
@@ -20,6 +22,22 @@ test: $(VENV)/installed
 benchmark: $(VENV)/peers
 	$(BIN)/python -m tests.benchmarks
 
+# Warnings are errors: mkdocs.yml says strict.
+docs: $(TUTORIALS)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+
+# Notebooks are executed before the site is built, and only those that changed.
+build/tutorials/%.md: notebooks/%.ipynb $(VENV)/docs
+	mkdir -p $(@D)
+	$(BIN)/python -m nbconvert --to markdown --execute --ExecutePreprocessor.timeout=1200 \
+		--output-dir $(@D) $<
+
+notebooks: $(VENV)/notebooks
+	$(BIN)/jupyter lab notebooks
+
+package: $(VENV)/installed
+	$(BIN)/python -m tests.benchmarks package
+
 # torch is named first and pinned, so that no other package pulls in a different build of it.
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -32,5 +50,9 @@ $(VENV)/peers: $(VENV)/installed tests/benchmarks/peers.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r tests/benchmarks/peers.txt
 	touch $@
 
+$(VENV)/docs $(VENV)/notebooks: $(VENV)/%: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[$*]'
+	touch $@
+
 clean:
-	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .import_linter_cache .pytest_cache
+	rm -rf $(VENV) build site *.egg-info .mypy_cache .ruff_cache .import_linter_cache .pytest_cache

@@ -37,6 +37,13 @@ class Fit(Fitted):
     """A fitted model, and what can be done with it.
 
     The attributes are those of `Fitted`.
+
+    Examples:
+        >>> train, test = dgp.datasets.load("gas_furnace").train.split(60)
+        >>> quick = {"method": "map", "restarts": 1, "workers": 1, "progress": False}
+        >>> fit = dgp.fit(dgp.LinearDynamicGP(1, pairs=1), train, **quick)
+        >>> fit.forecast(train, test).mean.shape
+        (88, 1)
     """
 
     @isolated
@@ -249,6 +256,13 @@ def fit(
     Raises:
         ValueError: on channels that do not fit the model, constant or entirely missing outputs,
             unknown options or such that the method does not use, or where no start leads anywhere.
+
+    Examples:
+        >>> record = dgp.datasets.load("gas_furnace").train[:60]
+        >>> model = dgp.LinearDynamicGP(inputs=1, pairs=1)
+        >>> fit = dgp.fit(model, record, restarts=2, workers=1, progress=False)
+        >>> fit.method, len(fit.draws["noise_sd"])
+        ('importance', 300)
     """
     instance("model", model, Model, "LinearDynamicGP, Wiener, Cascade, ... make one.")
     if start is not None:
@@ -272,5 +286,15 @@ def load(path: str | Path) -> Fit:
     Raises:
         ValueError: where the file is missing, damaged, not a pyro_dynogp fit, or of a version
             that this package does not know.
+
+    Examples:
+        >>> import tempfile, pathlib
+        >>> record = dgp.datasets.load("gas_furnace").train[:60]
+        >>> quick = {"method": "map", "restarts": 1, "workers": 1, "progress": False}
+        >>> fit = dgp.fit(dgp.LinearDynamicGP(1, pairs=1), record, **quick)
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "furnace.safetensors"
+        >>> fit.save(path)
+        >>> dgp.load(path).model == fit.model
+        True
     """
     return Fit.of(storage.load(path))

@@ -23,6 +23,13 @@ class LTIParameters(gpytorch.Module):
 
     Args:
         modes: starting values, one output, no batch dimensions, no integrators.
+
+    Examples:
+        >>> modes = dgp.Modes([-1.0 + 2.0j], [[1.0 + 0.0j]], [0.5 + 0.0j], [[0.3 + 0.0j]])
+        >>> system = dgp.LTIParameters(modes)
+        >>> kernel, mean = dgp.LTIKernel(system), dgp.LTIMean(system, [0.0, 0.1], [[1.0], [0.0]])
+        >>> system.modes.pairs
+        1
     """
 
     def __init__(self, modes: Modes) -> None:
@@ -72,6 +79,11 @@ class LTIKernel(gpytorch.kernels.Kernel):
 
     The first column of the covariates is time [s]; further columns (inputs) are ignored. For the
     O(n) path use `LTIProcess`; this kernel is dense and serves GPyTorch models of any kind.
+
+    Examples:
+        >>> modes = dgp.Modes([-1.0 + 2.0j], [[1.0 + 0.0j]], [0.5 + 0.0j], [[0.3 + 0.0j]])
+        >>> dgp.LTIKernel(modes)(torch.tensor([0.0, 0.1]).double()).to_dense().shape
+        torch.Size([2, 2])
     """
 
     is_stationary = True
@@ -105,6 +117,12 @@ class LTIMean(gpytorch.means.Mean):
     With `time` given the covariate is time alone, in any order, and m(t) is evaluated exactly
     between samples too. Without it the rows of the covariates are sorted by time, so that a
     prediction of `ExactGP`, which appends the test rows to the training rows, carries the state on.
+
+    Examples:
+        >>> modes = dgp.Modes([-1.0 + 2.0j], [[1.0 + 0.0j]], [0.5 + 0.0j], [[0.3 + 0.0j]])
+        >>> mean = dgp.LTIMean(modes, [0.0, 0.1], [[1.0], [0.0]])
+        >>> mean(torch.tensor([[0.0], [0.1]]).double()).shape
+        torch.Size([2])
     """
 
     def __init__(

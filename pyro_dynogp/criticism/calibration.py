@@ -195,6 +195,14 @@ def calibration(
     Raises:
         ValueError: wrong types; other times or outputs; skip or level out of range; an output
             without measured samples; too few joint samples (for the level).
+
+    Examples:
+        >>> record = dgp.datasets.load("gas_furnace").train[:60]
+        >>> quick = {"method": "map", "restarts": 1, "workers": 1, "progress": False}
+        >>> fit = dgp.fit(dgp.LinearDynamicGP(1, pairs=1), record, **quick)
+        >>> found = dgp.calibration(fit.predict(record), record)
+        >>> "calibration" in found.verdict
+        True
     """
     pair = paired(prediction, record, skip)
     samples = _chosen(pair, seed)

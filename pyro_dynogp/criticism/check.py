@@ -113,6 +113,14 @@ def check(
     Raises:
         ValueError: where the fit does not know its training records; on a twin of a fit with
             trajectories as sites or by NUTS, or of fewer than 20 or more samples than there are.
+
+    Examples:
+        >>> record = dgp.datasets.load("gas_furnace").train[:60]
+        >>> quick = {"method": "map", "restarts": 1, "workers": 1, "progress": False}
+        >>> fit = dgp.fit(dgp.LinearDynamicGP(1, pairs=1), record, **quick)
+        >>> found = dgp.check(fit, forecasts=False, draws=100, workers=1, progress=False)
+        >>> print(found["one-step calibration"].name)
+        one-step calibration
     """
     known_fit(fit)
     findings: list[Finding] = []

@@ -88,6 +88,16 @@ def compare(
     Raises:
         ValueError: where data, gaps, target, horizon or scored samples differ: densities of other
             numbers cannot be compared.
+
+    Examples:
+        >>> record = dgp.datasets.load("gas_furnace").train[:60]
+        >>> quick = {"method": "map", "restarts": 1, "workers": 1, "progress": False}
+        >>> fit = dgp.fit(dgp.LinearDynamicGP(1, pairs=1), record, **quick)
+        >>> two = dgp.fit(dgp.LinearDynamicGP(1, pairs=2), record, **quick)
+        >>> options = {"draws": 100, "refits": 0, "workers": 1, "progress": False}
+        >>> table = dgp.compare({"one": fit, "two": two}, target="missing sample", **options)
+        >>> sorted(table.weights)
+        ['one', 'two']
     """
     if not isinstance(models, Mapping) or len(models) < 2:
         raise invalid("models", expected="two models or more by name", got=repr(type(models)))
@@ -209,6 +219,15 @@ def stack(
         fits: by name.
         weights: a `Comparison` of them, or numbers >= 0 by name. None: `compare` is run, for
             `target` and with `options`.
+
+    Examples:
+        >>> record = dgp.datasets.load("gas_furnace").train[:60]
+        >>> quick = {"method": "map", "restarts": 1, "workers": 1, "progress": False}
+        >>> fit = dgp.fit(dgp.LinearDynamicGP(1, pairs=1), record, **quick)
+        >>> two = dgp.fit(dgp.LinearDynamicGP(1, pairs=2), record, **quick)
+        >>> mixture = dgp.stack({"one": fit, "two": two}, {"one": 0.3, "two": 0.7})
+        >>> mixture.simulate(record).mean.shape
+        (60, 1)
     """
     if not isinstance(fits, Mapping) or not fits:
         raise invalid("fits", expected="fits by name", got=repr(fits))

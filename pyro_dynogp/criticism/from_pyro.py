@@ -59,6 +59,15 @@ def from_pyro(
     Raises:
         ValueError: on subsampled plates, sites without a draw, draws without a site, a model that
             observes nothing, or trajectories with a mask (mark missing samples by NaN).
+
+    Examples:
+        >>> def model(y):
+        ...     mu = pyro.sample("mu", dist.Normal(torch.tensor(0.0).double(), 1.0))
+        ...     pyro.sample("y", dist.Normal(mu, 1.0).expand(y.shape).to_event(1), obs=y)
+        >>> draws = {"mu": torch.randn(20, dtype=torch.float64)}
+        >>> posterior = dgp.from_pyro(model, draws, torch.ones(5, dtype=torch.float64))
+        >>> sorted(posterior.observed)
+        ['y']
     """
     if not callable(model):
         raise invalid("model", expected="a Pyro model", got=type(model).__name__)

@@ -82,6 +82,15 @@ def loo(
     Raises:
         ValueError: on an unknown target, on a record that the fit was not trained on, on models
             whose densities given other samples are not known.
+
+    Examples:
+        >>> record = dgp.datasets.load("gas_furnace").train[:60]
+        >>> quick = {"method": "map", "restarts": 1, "workers": 1, "progress": False}
+        >>> fit = dgp.fit(dgp.LinearDynamicGP(1, pairs=1), record, **quick)
+        >>> options = {"draws": 100, "refits": 0, "workers": 1, "progress": False}
+        >>> elpd = dgp.loo(fit, target="missing sample", **options)
+        >>> elpd.n_data_points, elpd["target"]
+        (60, 'missing sample')
     """
     if target not in TARGETS:
         raise invalid(

@@ -131,6 +131,15 @@ def predictive_checks(
     Raises:
         ValueError: wrong types; other times or outputs; skip out of range; an output without
             measured samples; too few joint samples; a statistic that returns no number; none left.
+
+    Examples:
+        >>> record = dgp.datasets.load("gas_furnace").train[:60]
+        >>> quick = {"method": "map", "restarts": 1, "workers": 1, "progress": False}
+        >>> fit = dgp.fit(dgp.LinearDynamicGP(1, pairs=1), record, **quick)
+        >>> largest = {"largest": lambda t, y: np.nanmax(y)}
+        >>> found = dgp.predictive_checks(fit.simulate(record), record, largest)
+        >>> found.p_value.shape
+        (1,)
     """
     wanted = _checked(statistics)
     pair = paired(prediction, record, skip)

@@ -109,6 +109,15 @@ def simulation_based_calibration(
         ValueError: on a model without scaling or with priors="paper", whose draws exceed
             floating-point range; several records; numbers out of range; options of `fit` that it
             cannot have here; where no replicate could be fitted.
+
+    Examples:
+        >>> record = dgp.datasets.load("gas_furnace").train[:60]
+        >>> model = dgp.LinearDynamicGP(1, pairs=1).scaled_to(record)
+        >>> options = {"method": "map", "replicates": 3, "draws": 9}
+        >>> quick = {"restarts": 1, "workers": 1, "progress": False}
+        >>> found = dgp.simulation_based_calibration(model, record[:30], **options, **quick)
+        >>> type(found).__name__
+        'SimulationBasedCalibration'
     """
     _check(model, record, method, replicates, draws, level, fit_options)
     model.check(record)

@@ -37,17 +37,13 @@ class Record:
     Args:
         time: (n,) strictly increasing; real numbers in `time_unit`, or time stamps with a time
             zone (pandas DatetimeIndex or Series, a list of datetimes). Steps may differ.
-        inputs: u (n, n_u) [input_units], or (n,) for one input; finite. None: no inputs.
+        inputs: u (n, n_u) [input_units], or (n,) for one; finite. None: no inputs.
         outputs: y (n, n_y) [output_units], or (n,) for one output; NaN marks a missing sample.
             None: no outputs.
-        input_names: n_u names; by default "u", or "u1", "u2", ...
-        output_names: n_y names; by default "y", or "y1", "y2", ...
-        input_units: n_u units as text; by default "" (not stated).
-        output_units: n_y units as text.
+        input_names, output_names: by default "u" and "y", or "u1", "u2", ... and "y1", "y2", ...
+        input_units, output_units: units as text; by default "" (not stated).
         time_unit: unit of `time`; always "s" with time stamps.
-        extra: name -> (n,) recorded channels that a model does not use (NaN: missing). They
-            travel with slices and splits.
-        extra_units: name -> unit of the extra channels.
+        extra, extra_units: name -> (n,) channel that no model uses (NaN: missing), and its unit.
         name: label of the experiment (not part of equality).
         start: the instant (with time zone) at which `time` is zero. By default the first stamp
             where `time` holds time stamps, else None. Parts of a record keep it.
@@ -55,11 +51,16 @@ class Record:
     Attributes:
         time: (n,) float64; seconds since `start` where there is one.
         inputs, outputs: (n, n_u) and (n, n_y) float64, read-only.
-        extra: read-only mapping of read-only (n,) float64 arrays.
+        extra: read-only mapping of read-only (n,) float64 arrays; slices and splits keep it.
 
     Raises:
         ValueError: wrong shape, length, name or unit; a value that is no number; NaN or infinite
             inputs; infinite outputs; time that does not increase; stamps without a time zone.
+
+    Examples:
+        >>> record = dgp.Record([0.0, 0.1, 0.2], inputs=[1, 0, 1], outputs=[0.0, 0.4, np.nan])
+        >>> int(record.missing.sum()), len(record[:2])
+        (1, 2)
     """
 
     time: Array

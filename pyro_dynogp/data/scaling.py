@@ -44,6 +44,13 @@ class Scaling:
             whatever order and units they are given; what a function of several channels does
             channel by channel goes by it. By default as they are given.
         output_order: places of the outputs, likewise.
+
+    Examples:
+        >>> record = dgp.datasets.load("gas_furnace").train[:60]
+        >>> scaling = dgp.Scaling.from_records(record)
+        >>> scaled = (record.outputs - scaling.output_offset) / scaling.output_scale
+        >>> round(float(scaled.std()), 9)
+        1.0
     """
 
     time_step: float
@@ -211,6 +218,11 @@ class TimeScale:
     Attributes:
         step: median sampling step [s].
         duration: length of the record [s].
+
+    Examples:
+        >>> low, high = dgp.TimeScale(step=0.1, duration=100.0).rate_bounds
+        >>> low < high
+        True
     """
 
     step: float

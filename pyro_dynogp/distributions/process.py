@@ -1,9 +1,7 @@
 r"""Trajectories of stochastic LTI systems as Pyro distributions.
 
-`LTIProcess` is the noise-free trajectory: a Gaussian process over time with the mean response to
-the inputs and the stationary covariance of the process noise. `ObservedLTIProcess` adds white
-measurement noise and integrates the trajectory out exactly; `ConditionedLTIProcess` is the
-trajectory given noisy samples.
+`LTIProcess` is the noise-free trajectory, a Gaussian process over time. `ObservedLTIProcess` adds
+white measurement noise and integrates it out; `ConditionedLTIProcess` is it given noisy samples.
 """
 
 from __future__ import annotations
@@ -42,12 +40,10 @@ class LTIProcess(Trajectory):
         modes: the system; batch dimensions of the modes are batch dimensions of the distribution.
         time: t (n,) [s], increasing, or a `TimeGrid`.
         inputs: u (*b, n, n_u) [input], held constant between samples; None for no input.
-        initial_state: modal state at t[0]. None: mean zero and the stationary covariance. A
-            tensor x (*b, P), complex: that mean and the stationary covariance. A `ModalState`:
-            that Gaussian, integrated out exactly.
-        jitter: variance added to each sample of the noise-free trajectory, as a share of the
-            stationary variance: finely sampled smooth trajectories are singular in float64
-            without it. It plays no part in `observed`.
+        initial_state: at t[0]; a complex tensor x (*b, P) is its mean (None: zero), with the
+            stationary covariance; a `ModalState` is a Gaussian, integrated out exactly.
+        jitter: variance added to each sample, as a share of the stationary variance, but not in
+            `observed`: finely sampled smooth trajectories are singular in float64 without it.
         offset: constant added to the mean [output], of batch shape (*b), or (*b, n_y).
 
     Batch shape: that of modes, inputs, initial state and offset, broadcast. Event shape: (n,) for
@@ -55,6 +51,11 @@ class LTIProcess(Trajectory):
 
     Raises:
         ValueError: on shapes that do not fit, times that decrease, NaN in the inputs.
+
+    Examples:
+        >>> modes = dgp.Modes([-1.0 + 2.0j], [[1.0 + 0.0j]], [0.5 + 0.0j], [[0.3 + 0.0j]])
+        >>> dgp.LTIProcess(modes, [0.0, 0.1, 0.4], [[1.0], [0.0], [0.0]]).mean.shape
+        torch.Size([3])
     """
 
     def __init__(

@@ -20,6 +20,14 @@ class InnovationReparam(Reparam):
     value is exact for any hyperparameters, and the posterior of e is far better conditioned for
     NUTS than that of the trajectory. Use it as
     ``pyro.poutine.reparam(model, config={"g": InnovationReparam()})``.
+
+    Examples:
+        >>> modes = dgp.Modes([-1.0 + 2.0j], [[1.0 + 0.0j]], [0.5 + 0.0j], [[0.3 + 0.0j]])
+        >>> def model():
+        ...     pyro.sample("g", dgp.LTIProcess(modes, [0.0, 0.1], [[1.0], [0.0]]))
+        >>> standard = pyro.poutine.reparam(model, config={"g": dgp.InnovationReparam()})
+        >>> "g_innovations" in pyro.poutine.trace(standard).get_trace().nodes
+        True
     """
 
     def apply(self, msg: Any) -> Any:

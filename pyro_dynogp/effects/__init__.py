@@ -4,6 +4,10 @@ An effect is one class in one file: a test, blocks, words, and experiments that 
 `Effect` lists its parts. One of your own is given to `close_loop` among `effects`, as in
 `close_loop(fit, record, effects=(*CATALOGUE, Ageing()))`; docs/effects.md has all of `Ageing`, an
 actuator that ages, in one file of 60 lines.
+
+Examples:
+    >>> [effect.name for effect in dgp.effects.CATALOGUE][:3]
+    ['extra input', 'dead time', 'unmodelled dynamics']
 """
 
 from pyro_dynogp.effects.base import Effect

@@ -1,6 +1,11 @@
 """Measured records that ship with the package, and simulated ones, with their test protocols.
 
 `data/README.md` beside the files tells where each comes from and what its columns are.
+
+Examples:
+    >>> furnace = dgp.datasets.load("gas_furnace")
+    >>> len(furnace.train), furnace.full.input_names
+    (148, ('InputGasRate',))
 """
 
 from __future__ import annotations

@@ -1,4 +1,9 @@
-"""Guides for models of trajectories: a variational family for each latent site."""
+"""Guides for models of trajectories: a variational family for each latent site.
+
+Examples:
+    >>> sorted(dgp.guides.__all__)[:3]
+    ['Family', 'FullRank', 'GaussMarkov']
+"""
 
 from pyro_dynogp.guides.families import (
     Family,

@@ -169,6 +169,13 @@ class FullRank(_Started):
 
     Args:
         init_scale: first standard deviation. init: starting value of the site.
+
+    Examples:
+        >>> def model():
+        ...     pyro.sample("x", dist.Normal(torch.zeros(3).double(), 1.0).to_event(1))
+        >>> guide = dgp.LayerGuide(model, {"x": dgp.FullRank(init_scale=0.1)})
+        >>> guide()["x"].shape
+        torch.Size([3])
     """
 
     init_scale: float = 0.05
@@ -203,6 +210,14 @@ class GaussMarkov(_Started):
     Args:
         init_mean: first pseudo-observations, of the shape of the trajectory.
         init_sd: first standard deviation of their noise [output]: a number, or one each.
+
+    Examples:
+        >>> modes = dgp.Modes([-1.0 + 2.0j], [[1.0 + 0.0j]], [0.5 + 0.0j], [[0.3 + 0.0j]])
+        >>> def model():
+        ...     pyro.sample("g", dgp.LTIProcess(modes, [0.0, 0.1], [[1.0], [0.0]]))
+        >>> guide = dgp.LayerGuide(model, {"g": dgp.GaussMarkov(init_sd=0.5)})
+        >>> guide()["g"].shape
+        torch.Size([2])
     """
 
     init_mean: Any = None
@@ -240,6 +255,14 @@ class InducingTimes(_Started):
         count: number of inducing times, at most that of samples. seed: of their draw.
         init_scale: first standard deviation; 1 is that of the prior, less is learnt faster from
             informative records. init: starting trajectory.
+
+    Examples:
+        >>> modes = dgp.Modes([-1.0 + 2.0j], [[1.0 + 0.0j]], [0.5 + 0.0j], [[0.3 + 0.0j]])
+        >>> def model():
+        ...     pyro.sample("g", dgp.LTIProcess(modes, [0.0, 0.1, 0.2], [[1.0], [0.0], [0.0]]))
+        >>> guide = dgp.LayerGuide(model, {"g": dgp.InducingTimes(2)})
+        >>> guide()["g"].shape
+        torch.Size([3])
     """
 
     count: int

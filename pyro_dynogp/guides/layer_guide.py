@@ -67,6 +67,13 @@ class LayerGuide:
     Raises:
         ValueError: when first called, for names that are no latent sites, and families or starting
             values that do not fit their sites.
+
+    Examples:
+        >>> def model():
+        ...     pyro.sample("x", dist.Normal(torch.zeros(3).double(), 1.0).to_event(1))
+        >>> guide = dgp.LayerGuide(model, {"x": dgp.guides.MeanField()})
+        >>> guide()["x"].shape
+        torch.Size([3])
     """
 
     def __init__(

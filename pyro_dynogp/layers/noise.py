@@ -111,12 +111,22 @@ class Likelihood:
 
 
 def Gaussian() -> Likelihood:
-    """White Gaussian measurement noise of constant standard deviation."""
+    """White Gaussian measurement noise of constant standard deviation.
+
+    Examples:
+        >>> dgp.Wiener(1, likelihood=dgp.Gaussian()).likelihood == dgp.Gaussian()
+        True
+    """
     return Likelihood()
 
 
 def StudentT(degrees_of_freedom: float = 4.0) -> Likelihood:
-    """White Student-t measurement noise, for records with outliers."""
+    """White Student-t measurement noise, for records with outliers.
+
+    Examples:
+        >>> dgp.Wiener(1, likelihood=dgp.StudentT(6.0)).likelihood == dgp.StudentT(6.0)
+        True
+    """
     return Likelihood(degrees_of_freedom=POSITIVE.check("degrees_of_freedom", degrees_of_freedom))
 
 
@@ -130,6 +140,11 @@ def Heteroscedastic(inducing: int = 8, of: Driver = "inputs") -> Likelihood:
 
     Raises:
         ValueError: on other values.
+
+    Examples:
+        >>> noise = dgp.Heteroscedastic(of="output")
+        >>> dgp.LinearDynamicGP(1, likelihood=noise).likelihood == noise
+        True
     """
     return Likelihood(varying=True, inducing=inducing, of=of)
 

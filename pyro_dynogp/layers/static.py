@@ -181,13 +181,18 @@ def sample_static(
 ) -> StaticFunction:
     """Sample a static function of inputs of unit scale.
 
-    Args: as the attributes of `StaticPrior`, which lists the sites.
+    Arguments are the attributes of `StaticPrior`, which lists the sites.
 
     Returns:
         The function with the batch shape of the sites (particles).
 
     Raises:
         ValueError: if an option or shape is wrong.
+
+    Examples:
+        >>> f = dgp.sample_static("f", channels=1, outputs=1, inducing=8)  # inside a Pyro model
+        >>> f.mean(torch.zeros(5, 1, dtype=torch.float64)).shape
+        torch.Size([5, 1])
     """
     prior = StaticPrior(name, channels, outputs, inducing, kernel, mean, learn_locations, locations)
     return prior.function(sample(prior.sites()))
@@ -239,6 +244,11 @@ def static_gp(
 
     Raises:
         ValueError: if an option or shape is wrong, or x is not finite.
+
+    Examples:
+        >>> x = torch.linspace(-1.0, 1.0, 5, dtype=torch.float64)
+        >>> dgp.static_gp("f", x, inducing=8).shape  # inside a Pyro model
+        torch.Size([5])
     """
     d, e = 1 if channels is None else channels, 1 if outputs is None else outputs
     verify(channels=d, outputs=e)

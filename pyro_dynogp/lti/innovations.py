@@ -176,7 +176,7 @@ def innovations(
         z (*b, N) [output] and d (*b, N) [output^2], float64. Missing rows have d infinite, z
         without meaning. d is not positive, or NaN, from where on K is not positive definite.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from pyro_dynogp import Modes
         >>> from pyro_dynogp.lti.grid import time_grid

@@ -47,6 +47,11 @@ class Modes:
     Raises:
         ValueError: where shapes disagree, a number is not finite, or a pole is not stable (an
             integrator that noise drives is not, either).
+
+    Examples:
+        >>> modes = dgp.Modes([-1.0 + 2.0j], [[1.0 + 0.0j]], [0.5 + 0.0j], [[0.3 + 0.0j]])
+        >>> modes.pairs, modes.inputs
+        (1, 1)
     """
 
     poles: Tensor

@@ -49,6 +49,11 @@ def LinearDynamicGP(
 
     Raises:
         ValueError: on numbers below the least that makes sense, or unknown options.
+
+    Examples:
+        >>> model = dgp.LinearDynamicGP(inputs=2, outputs=1, pairs=3)
+        >>> model.inputs, model.layers[0].pairs
+        (2, 3)
     """
     layer = Dynamic(
         outputs=outputs,
@@ -80,6 +85,12 @@ def Cascade(
 
     Raises:
         ValueError: on layers that do not fit together, or unknown options.
+
+    Examples:
+        >>> layers = (dgp.Dynamic(pairs=2), dgp.Static(inducing=8))
+        >>> model = dgp.Cascade(1, layers, dgp.StudentT(4))
+        >>> [wire.name for wire in model.wires]
+        ['g', 'f']
     """
     if any(getattr(layer, "feedback", ()) for layer in layers or ()):
         options = {"integrate": "all", **options}
@@ -106,6 +117,11 @@ def Wiener(
         process_noise: whether g has any.
         likelihood: Gaussian by default.
         options: of `Model`: initial_state, integrate, priors, direct, channels, scaling.
+
+    Examples:
+        >>> model = dgp.Wiener(inputs=1, pairs=2, inducing=16)
+        >>> [wire.sources for wire in model.wires]
+        [('inputs',), ('g',)]
     """
     layers = (
         Dynamic(outputs=outputs, pairs=pairs, process_noise=process_noise),
@@ -127,7 +143,11 @@ def Hammerstein(
 ) -> Model:
     """A static nonlinearity f of the inputs, then linear dynamics g: a nonlinear actuator.
 
-    Args: as those of `Wiener`; f has one output for each input.
+    Arguments are those of `Wiener`; f has one output for each input.
+
+    Examples:
+        >>> [wire.name for wire in dgp.Hammerstein(inputs=1, pairs=2).wires]
+        ['f', 'g']
     """
     verify(inputs=inputs)
     layers = (
@@ -151,8 +171,16 @@ def WienerHammerstein(
 ) -> Model:
     """Linear dynamics g1, a static nonlinearity f, linear dynamics g2.
 
-    Args: as those of `Wiener`; pairs and process_noise for both dynamic layers or for each; width
-        is the number of signals between the layers.
+    Arguments are those of `Wiener`, but for
+
+    Args:
+        pairs: for both dynamic layers, or for each.
+        width: the number of signals between the layers.
+        process_noise: for both dynamic layers, or for each.
+
+    Examples:
+        >>> [wire.name for wire in dgp.WienerHammerstein(inputs=1, pairs=(2, 1)).wires]
+        ['g1', 'f', 'g2']
     """
     verify(width=width)
     first, second = pairs if isinstance(pairs, tuple) else (pairs, pairs)
@@ -182,11 +210,15 @@ def ParallelWienerHammerstein(
     The last dynamics see all branches, each with gains of its own: with enough pairs they are the
     sum of different dynamics for each branch.
 
-    Args: as those of `WienerHammerstein`; branches is their number, pairs those of each first layer
-        and of the last one, which has `branches` times as many.
+    Arguments are those of `WienerHammerstein`, but for
 
-    Example:
-        >>> [wire.sources for wire in ParallelWienerHammerstein(1).wires]
+    Args:
+        branches: their number.
+        pairs: those of each first layer, or of these and the last one, which has `branches` times
+            as many by default.
+
+    Examples:
+        >>> [wire.sources for wire in dgp.ParallelWienerHammerstein(1).wires]
         [('inputs',), ('g1',), ('inputs',), ('g2',), ('f1', 'f2')]
     """
     COUNT.check("branches", branches)
@@ -225,14 +257,16 @@ def NonlinearFeedback(
     them is what Gaussian processes are too smooth for: a friction that changes sign, an edge that
     a tank flows over.
 
-    Args: as those of `Wiener`; f sees all outputs and has as many, the output measured is g's.
+    Arguments are those of `Wiener`. f sees all outputs and has as many; that of g is measured.
+
+    Args:
         hidden: number of signals that f2 sees and has as outputs.
         step: whether a step of the hidden signal, or of the output where there is none, comes back
             as well; by default with one hidden signal.
         kernel: of the functions, a gpytorch kernel; Matern-5/2 by default.
 
-    Example:
-        >>> model = NonlinearFeedback(1, pairs=1)
+    Examples:
+        >>> model = dgp.NonlinearFeedback(1, pairs=1)
         >>> [wire.name for wire in model.wires], model.output_wire.name
         (['g', 'f'], 'g')
         >>> [wire.name for wire in NonlinearFeedback(1, hidden=1).wires]
@@ -283,7 +317,11 @@ def HammersteinWiener(
 ) -> Model:
     """A static nonlinearity f1 of the inputs, linear dynamics g, a static nonlinearity f2.
 
-    Args: as those of `Wiener`; inducing for both static layers or for each.
+    Arguments are those of `Wiener`; inducing for both static layers or for each.
+
+    Examples:
+        >>> [wire.name for wire in dgp.HammersteinWiener(inputs=1, pairs=2).wires]
+        ['f1', 'g', 'f2']
     """
     first, second = inducing if isinstance(inducing, tuple) else (inducing, inducing)
     verify(inputs=inputs)

@@ -41,6 +41,11 @@ class Dynamic:
             beside a position, a level in another tank. Functions see them by the name of the layer
             and "_hidden", as in ``Static(sees=("g_hidden",))``; in models with feedback.
         name: prefix of its sites; g, or g1, g2, ... by default.
+
+    Examples:
+        >>> layers = (dgp.Dynamic(outputs=2, pairs=3), dgp.Static(), dgp.Dynamic(skip=("inputs",)))
+        >>> [wire.sources for wire in dgp.Cascade(1, layers).wires]
+        [('inputs',), ('g1',), ('f', 'inputs')]
     """
 
     outputs: int = 1
@@ -95,6 +100,11 @@ class Static:
         support: number of points at which the residual of the function given its inducing values
             is drawn, where the layer feeds a dynamic one and is not integrated out.
         name: prefix of its sites; f, or f1, f2, ... by default.
+
+    Examples:
+        >>> sensor = dgp.Static(inducing=8, mean="linear")
+        >>> dgp.Cascade(1, (dgp.Dynamic(pairs=2), sensor)).wires[1].name
+        'f'
     """
 
     outputs: int = 1
@@ -137,9 +147,8 @@ class Known:
             More than one signal only where all of them are inputs, or static functions of inputs.
         name: prefix of its sites; f, or f1, f2, ... by default.
 
-    Example:
-        >>> import pyro.distributions as dist
-        >>> friction = Known(lambda v, w: (v / w).tanh(), {"w": dist.LogNormal(0.0, 1.0)})
+    Examples:
+        >>> friction = dgp.Known(lambda v, w: (v / w).tanh(), {"w": dist.LogNormal(0.0, 1.0)})
         >>> friction.outputs, sorted(friction.parameters)
         (1, ['w'])
     """

@@ -74,6 +74,13 @@ class Model(Structure):
 
     Raises:
         ValueError: on layers that do not fit together, or unknown options.
+
+    Examples:
+        >>> record = dgp.datasets.load("gas_furnace").train[:60]
+        >>> model = dgp.LinearDynamicGP(1, pairs=1).scaled_to(record)
+        >>> trace = pyro.poutine.trace(model).get_trace(record)
+        >>> trace.nodes["y"]["value"].shape
+        torch.Size([60])
     """
 
     # Sites may have a batch dimension on the left: many points go through the model at once.

@@ -292,14 +292,16 @@ def sample_modes(
 ) -> Modes:
     """Sample a stochastic LTI system, for inputs and outputs of unit standard deviation.
 
-    Args: as the attributes of `ModesPrior`, which lists the sites.
-        time_scale: by default time is counted in samples of a record of 1000.
-
-    Returns:
-        Modes with the batch shape of the sites (particles).
+    Arguments are the attributes of `ModesPrior`, which lists the sites; by default time is counted
+    in samples of a record of 1000. Modes have the batch shape of the sites (particles).
 
     Raises:
         ValueError: on unknown priors, or a record of three samples or fewer.
+
+    Examples:
+        >>> modes = dgp.sample_modes("g", inputs=1, pairs=2)  # inside a Pyro model
+        >>> modes.pairs
+        2
     """
     prior = ModesPrior(
         name, inputs, pairs, outputs, brownian, noise, feedthrough, process_noise,

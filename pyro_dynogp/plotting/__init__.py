@@ -3,6 +3,11 @@
 Every function returns a matplotlib Figure that belongs to nobody else: no pyplot, no global state,
 no display needed. Save it with ``figure.savefig("name.png")``; a notebook shows it as it is.
 Figures of closing the loop are in `pyro_dynogp.report.figures`.
+
+Examples:
+    >>> figure = dgp.plotting.record(dgp.datasets.load("gas_furnace").train)
+    >>> len(figure.axes)
+    2
 """
 
 from pyro_dynogp.plotting.calibration import calibration, predictive_checks

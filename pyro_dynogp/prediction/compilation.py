@@ -102,7 +102,7 @@ def compile_kernels(*, workers: int | None = None, progress: bool = True) -> Non
     Args:
         workers: processes; None for all processors. progress: whether to show a bar.
 
-    Example:
+    Examples:
         >>> from pyro_dynogp.prediction.compilation import compile_kernels
         >>> compile_kernels(workers=1, progress=False)
     """

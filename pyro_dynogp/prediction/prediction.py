@@ -87,6 +87,14 @@ class Prediction:
         kind: what was predicted, in words.
         weights: (S,) of the components; None for equal ones.
         output_units: of the n_y outputs; None where they are not known.
+
+    Examples:
+        >>> record = dgp.datasets.load("gas_furnace").train[:60]
+        >>> quick = {"method": "map", "restarts": 1, "workers": 1, "progress": False}
+        >>> fit = dgp.fit(dgp.LinearDynamicGP(1, pairs=1), record, **quick)
+        >>> simulation = fit.simulate(record)
+        >>> simulation.quantile(0.9).shape, list(simulation.parts)[0]
+        ((60, 1), 'parameters')
     """
 
     time: np.ndarray

@@ -28,14 +28,20 @@ def scores(prediction: Prediction, record: Record, skip: int = 0) -> dict[str, A
         - ``rmse``, ``mae`` [output]: of the predictive mean.
         - ``nrmse``: rmse over the standard deviation of the measured output.
         - ``fit_percent``: 100 (1 - nrmse), the fit index of system identification [%].
-        - ``crps`` [output]: continuous ranked probability score of the normal mixture
-          (`pyro_dynogp.prediction.mixture_score`).
+        - ``crps`` [output]: of the normal mixture (`pyro_dynogp.prediction.mixture_score`).
         - ``negative_log_density`` [nats per sample]: of each sample by itself.
         - ``coverage_50``, ``coverage_95``: share of samples within the central intervals.
         - ``count``: number of samples scored.
 
     Raises:
         ValueError: where times, outputs or units differ, none is left, or skip is out of range.
+
+    Examples:
+        >>> record = dgp.datasets.load("gas_furnace").train[:60]
+        >>> quick = {"method": "map", "restarts": 1, "workers": 1, "progress": False}
+        >>> fit = dgp.fit(dgp.LinearDynamicGP(1, pairs=1), record, **quick)
+        >>> dgp.scores(fit.simulate(record), record)["count"]
+        60
     """
     instance("prediction", prediction, Prediction)
     prediction.check(record)

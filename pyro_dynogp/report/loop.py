@@ -86,6 +86,17 @@ def close_loop(
 
     Raises:
         ValueError: on blocks that are too short, unknown candidates, numbers that make no sense.
+
+    Examples:
+        >>> record = dgp.datasets.load("gas_furnace").full[:240]
+        >>> quick = {"method": "map", "restarts": 1, "workers": 1, "progress": False}
+        >>> fit = dgp.fit(dgp.LinearDynamicGP(1, pairs=1), record[:120], **quick)
+        >>> drift = (dgp.effects.CATALOGUE[10],)  # one effect, to be quick
+        >>> report = dgp.close_loop(
+        ...     fit, record, effects=drift, max_rounds=1, workers=1, progress=False
+        ... )
+        >>> report.fit.method
+        'map'
     """
     known_fit(fit)
     one_record(record, "Close the loop on one record.")

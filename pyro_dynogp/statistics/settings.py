@@ -95,6 +95,11 @@ class LoopSettings:
 
     Raises:
         ValueError: on a number that is not positive.
+
+    Examples:
+        >>> strict = dgp.LoopSettings(gain=8.0, standard_errors=3.0)
+        >>> strict.gain, strict.level_samples
+        (8.0, 10)
     """
 
     gain: float = 4.0

@@ -29,10 +29,12 @@ from tests.benchmarks import (
     leaderboard,
     loop_cost,
     measured,
+    package,
     planted,
     reference,
     reliability,
     selection,
+    slow_pages,
     speed,
     thresholds,
     wiener,
@@ -67,6 +69,8 @@ PARTS = {
     "paper": paper.run,
     "growth": growth.run,
     "reliability": reliability.run,
+    "slow_pages": slow_pages.run,
+    "package": package.run,
 }
 
 

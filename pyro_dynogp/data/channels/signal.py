@@ -79,7 +79,7 @@ class Delayed(Replacement):
     Raises:
         ValueError: where `delay` or `median` is no number, or both are given.
 
-    Example:
+    Examples:
         >>> import numpy as np, pyro_dynogp as dgp
         >>> rng = np.random.default_rng(0)
         >>> u, y = np.repeat(rng.normal(size=20), 6), np.zeros(120)

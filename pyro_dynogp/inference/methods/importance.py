@@ -50,6 +50,13 @@ class Importance:
 
     Raises:
         ValueError: on an unknown optimizer, or fewer than one draw.
+
+    Examples:
+        >>> record = dgp.datasets.load("gas_furnace").train[:60]
+        >>> model, method = dgp.LinearDynamicGP(1, pairs=1), dgp.Importance(draws=50)
+        >>> fit = dgp.fit(model, record, method=method, restarts=1, workers=1, progress=False)
+        >>> len(fit.draws["noise_sd"])
+        50
     """
 
     draws: int = 300

@@ -104,6 +104,13 @@ class Mode:
 
     Raises:
         ValueError: on an unknown optimizer.
+
+    Examples:
+        >>> record = dgp.datasets.load("gas_furnace").train[:60]
+        >>> model, method = dgp.LinearDynamicGP(1, pairs=1), dgp.Mode(optimizer="lbfgs")
+        >>> fit = dgp.fit(model, record, method=method, restarts=1, workers=1, progress=False)
+        >>> fit.method
+        'map'
     """
 
     optimizer: Optimizer | None = None

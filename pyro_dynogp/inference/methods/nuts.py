@@ -60,6 +60,13 @@ class Nuts:
 
     Raises:
         ValueError: on an unknown optimizer, or numbers below one, or below four for draws.
+
+    Examples:
+        >>> record = dgp.datasets.load("gas_furnace").train[:60]
+        >>> model, method = dgp.LinearDynamicGP(1, pairs=1), dgp.Nuts(chains=1, warmup=5, draws=5)
+        >>> fit = dgp.fit(model, record, method=method, restarts=1, workers=1, progress=False)
+        >>> len(fit.draws["noise_sd"])
+        5
     """
 
     chains: int = 4

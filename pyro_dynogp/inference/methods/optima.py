@@ -73,6 +73,14 @@ class Normal:
 
     Raises:
         ValueError: on unknown names, or numbers below one.
+
+    Examples:
+        >>> record = dgp.datasets.load("gas_furnace").train[:60]
+        >>> model, method = dgp.LinearDynamicGP(1, pairs=1), dgp.Normal(draws=40)
+        >>> quick = {"restarts": 1, "steps": 20, "workers": 1, "progress": False}
+        >>> fit = dgp.fit(model, record, method=method, **quick)
+        >>> fit.method, len(fit.draws["noise_sd"])
+        ('svi', 40)
     """
 
     family: Hyperparameters | Literal["auto"] = "auto"

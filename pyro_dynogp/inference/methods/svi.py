@@ -36,6 +36,13 @@ class TrainingDivergedError(ValueError):
             checkpoint. elbo: (step,) history up to it.
         sites: names of the sample sites and parameters that were not finite, or whose density
             could not be computed.
+
+    Examples:
+        >>> try:
+        ...     raise dgp.TrainingDivergedError("the ELBO is not finite", 7, {}, np.zeros(7))
+        ... except dgp.TrainingDivergedError as error:
+        ...     error.step
+        7
     """
 
     def __init__(

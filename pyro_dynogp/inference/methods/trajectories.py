@@ -149,6 +149,14 @@ class Trajectories:
 
     Raises:
         ValueError: on numbers below one, or a guide that holds its own parameters.
+
+    Examples:
+        >>> record = dgp.datasets.load("gas_furnace").train[:60]
+        >>> model = dgp.Wiener(1, pairs=1, inducing=6)
+        >>> method = dgp.Trajectories(draws=20, particles=2)
+        >>> quick = {"restarts": 1, "steps": 3, "workers": 1, "progress": False}
+        >>> dgp.fit(model, record, method=method, **quick).method
+        'svi'
     """
 
     guide: GuideChoice = "gauss-markov"

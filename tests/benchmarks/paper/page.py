@@ -200,8 +200,8 @@ def _against_peers(rows: Sequence[Row], system: Callable[[int], System]) -> list
         bounds = np.array([clean_error_bound(system(seed)) for seed in seeds])
         own = np.array([_score(found[OURS, seed], "clean_over_floor") for seed in seeds])
         lines.append(
-            f"- Cramer-Rao bound of the clean RMSE / floor, for who knows all but the response to "
-            f"the inputs: {spread(bounds)}, which is an RMSE / floor of "
+            f"- Cramer-Rao bound of the clean RMSE / floor, if all except the response to "
+            f"the inputs were given: {spread(bounds)}, which is an RMSE / floor of "
             f"{number(float(np.median(np.sqrt(1.0 + bounds**2))))} in the median; the clean RMSE "
             f"is {spread(own / bounds)} times the bound."
         )
