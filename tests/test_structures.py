@@ -22,7 +22,7 @@ def test_a_spring_forecasts_where_a_line_does_not(found):
 
 
 def test_a_hidden_signal_forecasts_within_the_noise(found):
-    assert found["errors"]["hidden"] < 0.03  # the noise is 0.02
+    assert found["errors"]["hidden"] < 0.018  # the noise is 0.02
 
 
 def test_known_functions_forecast_near_the_noise(found):
