@@ -56,7 +56,6 @@ if TYPE_CHECKING:  # the same names, for editors and type checkers; a test compa
     from pyro_dynogp.models.architectures import Hammerstein as Hammerstein
     from pyro_dynogp.models.architectures import HammersteinWiener as HammersteinWiener
     from pyro_dynogp.models.architectures import LinearDynamicGP as LinearDynamicGP
-    from pyro_dynogp.models.architectures import NonlinearFeedback as NonlinearFeedback
     from pyro_dynogp.models.architectures import (
         ParallelWienerHammerstein as ParallelWienerHammerstein,
     )
@@ -66,6 +65,7 @@ if TYPE_CHECKING:  # the same names, for editors and type checkers; a test compa
     from pyro_dynogp.models.layer import Known as Known
     from pyro_dynogp.models.layer import Static as Static
     from pyro_dynogp.models.model import Model as Model
+    from pyro_dynogp.models.nonlinear_feedback import NonlinearFeedback as NonlinearFeedback
     from pyro_dynogp.models.priors import sample_modes as sample_modes
     from pyro_dynogp.models.step import Step as Step
     from pyro_dynogp.prediction.prediction import Prediction as Prediction
@@ -96,7 +96,7 @@ HOMES = {
     "Hammerstein": "models.architectures",
     "WienerHammerstein": "models.architectures",
     "HammersteinWiener": "models.architectures",
-    "NonlinearFeedback": "models.architectures",
+    "NonlinearFeedback": "models.nonlinear_feedback",
     "ParallelWienerHammerstein": "models.architectures",
     "Cascade": "models.architectures",
     "Model": "models.model",

@@ -16,8 +16,9 @@ import torch
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.density import Potential
-from pyro_dynogp.models.architectures import LinearDynamicGP, NonlinearFeedback, Wiener
+from pyro_dynogp.models.architectures import LinearDynamicGP, Wiener
 from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.nonlinear_feedback import NonlinearFeedback
 from pyro_dynogp.models.output_process import OutputProcess
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.prepared import PreparedRecord
