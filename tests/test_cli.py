@@ -412,7 +412,7 @@ def most():
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 before = most()
-read_table(Path(sys.argv[1]), None, None, None, None, "utf-8")
+read_table(Path(sys.argv[1]))
 print(most() - before)
 """
 

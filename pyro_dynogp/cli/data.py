@@ -130,7 +130,7 @@ def record_for(fitted: Fit, data: str, clock: Clock) -> tuple[Record, bool]:
         _refuse(data, clock)
         return _selected(data, scaling.input_names, scaling.output_names).test, True
     path = existing(data)
-    columns = read_table(path, None, None, None, None, "utf-8-sig").columns
+    columns = read_table(path).columns
     measured = all(name in columns for name in scaling.output_names)
     record = _from_csv(
         path,
@@ -196,7 +196,7 @@ def _numeric(path: Path, used: tuple[str | None, ...]) -> tuple[tuple[str, ...],
 
     from pyro_dynogp.data.text_table import read_table
 
-    table = read_table(path, None, None, None, None, "utf-8-sig")
+    table = read_table(path)
     kept: list[str] = []
     left_out: list[str] = []
     for name in table.columns:

@@ -74,7 +74,7 @@ def _tell_columns(path: Path) -> None:
 
     from pyro_dynogp.data.text_table import read_table
 
-    table = read_table(path, None, None, None, None, "utf-8-sig")
+    table = read_table(path)
     click.echo(f"{path}: {len(table.lines)} rows, {len(table.columns)} columns")
     heads = "".join(f"{head:>13}" for head in ("min", "mean", "max", "missing"))
     click.echo(f"{'column':<24}{'holds':<13}{heads}")

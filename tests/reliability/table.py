@@ -8,12 +8,15 @@ from __future__ import annotations
 import dataclasses
 import functools
 import tempfile
+import types
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import gpytorch
 import numpy as np
+import pandas as pd
+import scipy.io
 import torch
 
 import pyro_dynogp as dgp
@@ -68,6 +71,22 @@ class World:
     @functools.cached_property
     def modes(self):
         return dgp.Modes([-0.5 + 2.0j], [[0.5 + 0.15j]], [1.0], [[0.03]])
+
+    @functools.cached_property
+    def frame(self):
+        return pd.DataFrame({"t": [0.0, 1.0, 2.0], "u": [1.0, 2.0, 4.0], "y": [0.5, 1.0, 2.0]})
+
+    @functools.cached_property
+    def text(self):
+        path = tempfile.mkdtemp() + "/data.csv"
+        self.frame.to_csv(path, index=False)
+        return path
+
+    @functools.cached_property
+    def matlab(self):
+        path = tempfile.mkdtemp() + "/data.mat"
+        scipy.io.savemat(path, {name: self.frame[name].to_numpy() for name in self.frame})
+        return path
 
     @functools.cached_property
     def past(self):
@@ -126,6 +145,12 @@ LAYER = {"inputs": NUMBER, "outputs": COUNT, "pairs": COUNT, "process_noise": SW
 CURVED = {**LAYER, "inducing": COUNT, "kernel": KERNEL}
 RUN = {"seed": SEED, "workers": COUNT, "progress": SWITCH}
 SAMPLES = {"samples": COUNT, "seed": SEED}
+# Options of every reader.
+SOURCE = {"inputs": ("v", ["u", "v"], 3), "outputs": ("v", ["y", "v"], 3), "output": ("y", 3),
+          "time": ("v", 3), "sampling_time": (1.0, -1, "a"), "timezone": (3,),
+          "time_unit": (3,), "extra": ("v", ["v"], 3), "input_units": (["a", "b"], 3),
+          "output_units": (["a", "b"], 3), "extra_units": ({"v": "m"}, 3), "name": (3,),
+          "nonsense": (1,)}  # fmt: skip
 VARIATIONAL = {"draws": COUNT, "particles": COUNT, "learning_rate": POSITIVE}
 
 
@@ -211,6 +236,25 @@ TABLE: dict[str, Entry] = {
         "extra": ({"a": [1.0]}, {3: [1.0, 2.0, 3.0]}, {"a": "text"}, {"y": [1.0, 2.0, 3.0]}, 3),
         "extra_units": ({"a": "m"}, 3)}, free=("name",),
         time=[0.0, 1.0, 2.0], inputs=[1.0, 2.0, 4.0], outputs=[0.0, 1.0, 2.0]),
+    "Record.from_csv": Entry(lambda w: dgp.Record.from_csv,
+        lambda w: {"path": w.text, "inputs": "u", "outputs": "y", "time": "t"},
+        {"path": ("/absent", "/proc", 3, None), **SOURCE, "header": (3, "a"), "names": (["a"], 3),
+         "delimiter": ("ab", "", 3), "decimal": ("'", 3, "ab"), "encoding": ("nonsense", 3),
+         "skip_rows": (-1, 1.5, True, "a", None, 50), "units_row": (3, "a"),
+         "missing": (True, object(), [None], [[1]]), "thousands": ("x", 3, "", "ab"),
+         "time_format": (3, "%Q", "%d.%m.%Y")}),
+    "Record.from_frame": Entry(lambda w: dgp.Record.from_frame,
+        lambda w: {"frame": w.frame, "inputs": "u", "outputs": "y", "time": "t"},
+        {"frame": (None, 3, "text", [1, 2], {"a": 1}), **SOURCE}),
+    "Record.from_xarray": Entry(lambda w: dgp.Record.from_xarray,
+        lambda w: {"dataset": w.frame.set_index("t").rename_axis("time").to_xarray(), "inputs": "u",
+                   "outputs": "y"}, {"dataset": (None, 3, "text"), **SOURCE}),
+    "Record.from_mat": Entry(lambda w: dgp.Record.from_mat,
+        lambda w: {"path": w.matlab, "inputs": "u", "outputs": "y", "time": "t"},
+        {"path": ("/absent", "/proc", __file__, 3, None), **SOURCE}),
+    "Record.from_benchmark": Entry(lambda w: dgp.Record.from_benchmark,
+        lambda w: {"data": types.SimpleNamespace(u=[1.0, 2.0], y=[1.0, 2.0]), "sampling_time": 1},
+        {"data": (None, 3, "text"), "sampling_time": (0, -1.0, np.nan, "a", True, [1.0])}),
     "Scaling": Entry(lambda w: dgp.Scaling.from_records, lambda w: {"records": w.record},
                      {"records": RECORD}),
     "Prediction": Entry(lambda w: w.prediction.quantile, lambda w: {"q": 0.5},
