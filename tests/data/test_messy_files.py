@@ -233,6 +233,18 @@ class TestStamps:
         with pytest.raises(ValueError, match="time_format"):
             self.read("01/02/2024", form="%Q")
 
+    @pytest.mark.parametrize("form", ["%d.%m.%Y %H:%M:%S", "%m/%d/%Y %H:%M:%S"])
+    def test_two_ways_of_parsing_agree(self, form):
+        stamps = pd.date_range("2023-12-30 22:58:59", periods=200, freq="17h61s")
+        cells = list(stamps.strftime(form))
+        assert self.read(*cells, form=form).equals(pd.DatetimeIndex(stamps))
+        short = [cell.replace("/0", "/").replace(".0", ".") for cell in cells]
+        assert self.read(*short, form=form).equals(pd.DatetimeIndex(stamps))
+        with pytest.raises(ValueError, match="line 3"):
+            self.read(cells[0], cells[0].replace(form[2], "-"), form=form)
+        with pytest.raises(ValueError, match="line 3"):
+            self.read(cells[0], cells[0].replace("12", "32").replace("30", "32"), form=form)
+
     def test_forms_that_change(self):
         with pytest.raises(ValueError, match="'2024-11-25 10:00' in column 't', line 3"):
             self.read("25.11.2024 10:00", "2024-11-25 10:00")
