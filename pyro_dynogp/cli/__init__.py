@@ -13,12 +13,12 @@ import click
 from pyro_dynogp.cli.close_loop import close_loop
 from pyro_dynogp.cli.compilation import compile_now
 from pyro_dynogp.cli.criticism import check, compare
-from pyro_dynogp.cli.data import InvalidInput, Modelled, training_and_test
+from pyro_dynogp.cli.data import InvalidInput, training_and_test
 from pyro_dynogp.cli.example import example
 from pyro_dynogp.cli.files import check_folder, saved
 from pyro_dynogp.cli.messages import in_flags, notes
 from pyro_dynogp.cli.models import KINDS, MODELS, made, tell_method
-from pyro_dynogp.cli.options import CHANNELS, PAIRS, READING, WORK, seed
+from pyro_dynogp.cli.options import CHANNELS, PAIRS, READING, WORK, Modelled, seed
 from pyro_dynogp.cli.predictions import forecast, simulate
 
 

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Unpack
 
 import click
 
-from pyro_dynogp.cli.data import Columns, InvalidInput, whole_record
+from pyro_dynogp.cli.data import InvalidInput, whole_record
 from pyro_dynogp.cli.files import check_folder, saved
 from pyro_dynogp.cli.models import MODELS, loaded, made
-from pyro_dynogp.cli.options import CHANNELS, PAIRS, WORK, seed
+from pyro_dynogp.cli.options import CHANNELS, PAIRS, WORK, Columns, seed
 
 if TYPE_CHECKING:
     from pyro_dynogp.fitting import Fit

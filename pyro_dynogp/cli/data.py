@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any
 
 import click
+
+from pyro_dynogp.cli.options import LAYOUT, Clock, Columns
 
 if TYPE_CHECKING:
     from pyro_dynogp.data.record import Record
@@ -34,45 +36,6 @@ class InvalidInput(click.ClickException):
     """Input that a user can put right: one line, exit code 2."""
 
     exit_code = 2
-
-
-class Clock(TypedDict):
-    """Options about time and about how a file is written, as in `Record.from_csv`."""
-
-    time: str | None
-    sampling_time: float | None
-    timezone: str | None
-    time_unit: str | None
-    time_format: str | None
-    missing: tuple[str, ...]
-    skip_rows: int
-    units_row: bool | None
-    encoding: str | None
-    delimiter: str | None
-    decimal: str | None
-    thousands: str | None
-
-
-# Options of how a file is written, as the reader has them.
-LAYOUT = (
-    "time_format", "missing", "skip_rows", "units_row", "encoding", "delimiter", "decimal",
-    "thousands",
-)  # fmt: skip
-
-
-class Columns(Clock):
-    """What the columns of DATA are: names, NAME=UNIT of some of them, and the clock."""
-
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    units: tuple[str, ...]
-
-
-class Modelled(Columns):
-    """The columns of DATA, and the model to fit to them: its name and number of pole pairs."""
-
-    kind: str
-    pairs: int | None
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 import click
 
-from pyro_dynogp.cli.data import Clock, InvalidInput, record_for
+from pyro_dynogp.cli.data import InvalidInput, record_for
 from pyro_dynogp.cli.files import check_folder
 from pyro_dynogp.cli.models import loaded
-from pyro_dynogp.cli.options import CLOCK
+from pyro_dynogp.cli.options import CLOCK, Clock
 
 if TYPE_CHECKING:
     from pyro_dynogp.data.record import Record
