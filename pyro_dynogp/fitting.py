@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from pyro_dynogp.criticism import inference_data
+from pyro_dynogp.criticism.summary import Summary, summarise
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference import storage
 from pyro_dynogp.inference.fitted import Fitted, known_fit
@@ -18,7 +19,6 @@ from pyro_dynogp.inference.methods.base import Method, Problem
 from pyro_dynogp.inference.methods.choose import method_of
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.stability import warnings_of
-from pyro_dynogp.inference.summary import summary
 from pyro_dynogp.inference.training import train_model
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.outputs import output_process
@@ -186,9 +186,37 @@ class Fit(Fitted):
         )
 
     @isolated
-    def summary(self) -> str:
-        """A few lines: what was fitted, how well it went, the modes at the best optimum."""
-        return summary(self)
+    def summary(self, record: Record | None = None) -> Summary:
+        """What was fitted, how well it went, and a table of what it says about the plant.
+
+        The table has the mean, the standard deviation and the central 95 % interval of natural
+        frequencies and damping ratios (in each draw ordered by the frequency), steady-state gains
+        of linear models, noise, dead times and lengthscales, in the units of the record. A fit at
+        the mode has no spread.
+
+        Args:
+            record: to score predictions of, from the inputs alone and one step ahead.
+
+        Returns:
+            Text; its `table` and `scores` are DataFrames.
+
+        Raises:
+            ValueError: a record of other channels or units, or without outputs.
+        """
+        return summarise(self, record)
+
+    def __repr__(self) -> str:
+        count = len(next(iter(self.draws.values())))
+        layers = " -> ".join(wire.name for wire in self.model.wires)
+        samples = sum(len(record) for record in self.records)
+        return (
+            f"Fit({layers}, inputs={list(self.scaling.input_names)}, "
+            f"outputs={list(self.scaling.output_names)}, method={self.method!r}, draws={count}, "
+            f"samples={samples}, seed={self.seed})"
+        )
+
+    def _repr_html_(self) -> str:
+        return self.summary()._repr_html_()
 
 
 @isolated

@@ -28,6 +28,7 @@ from pyro_dynogp.data.fields import checked
 from pyro_dynogp.data.sources import Sources
 from pyro_dynogp.data.writers import RecordTensors
 from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.shown import preformatted
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
@@ -299,6 +300,9 @@ class Record(Sources):
             f"inputs={list(self.input_names)}, outputs={list(self.output_names)}, "
             f"missing={int(self.missing.sum())}, extra={list(self.extra)})"
         )
+
+    def _repr_html_(self) -> str:
+        return preformatted(self.summary())
 
     def summary(self) -> str:
         """Table of the channels: role, unit, smallest, mean and largest value, gaps."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from pyro_dynogp.statistics.evidence import Curve, Evidence
+from pyro_dynogp.support.shown import shown
 
 if TYPE_CHECKING:
     from pyro_dynogp.data.record import Record
@@ -29,7 +30,8 @@ RELY_ON_BEFORE = (
 )
 
 
-@dataclass(frozen=True, eq=False)
+@shown
+@dataclass(repr=False, frozen=True, eq=False)
 class Attempt:
     """One effect that was considered in one round.
 
@@ -91,7 +93,8 @@ class EffectTest:
     decision: Outcome
 
 
-@dataclass(frozen=True, eq=False)
+@shown
+@dataclass(repr=False, frozen=True, eq=False)
 class FoundEffect:
     """An effect that was added to the model, or one that is only reported (feedback).
 
@@ -120,7 +123,8 @@ class FoundEffect:
     experiment: str = ""
 
 
-@dataclass(frozen=True, eq=False)
+@shown
+@dataclass(repr=False, frozen=True, eq=False)
 class LoopResult:
     """Result of `close_loop`.
 
