@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from pyro_dynogp.criticism import inference_data
+from pyro_dynogp.criticism.control_bridge import Kind, to_control
 from pyro_dynogp.criticism.summary import Summary, summarise
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference import storage
@@ -184,6 +185,33 @@ class Fit(Fitted):
         return inference_data.to_arviz(
             self, future=future, samples=samples, prior_samples=prior_samples, seed=seed
         )
+
+    @isolated
+    def to_control(
+        self,
+        *,
+        kind: Kind = "state space",
+        step: float | None = None,
+        draws: int | None = None,
+        layer: str | None = None,
+    ) -> Any:
+        """The linear system as an object of python-control, which has to be installed.
+
+        Args:
+            kind: "state space" (control.StateSpace) or "transfer function"
+                (control.TransferFunction).
+            step: sampling time [time unit], for a system that is exactly sampled with the input
+                held over each step; None for one in continuous time.
+            draws: a list of so many posterior draws, spread evenly over all; None for the system
+                at the best optimum alone.
+            layer: of a cascade, the dynamic layer, whose signals are in standard deviations. A
+                linear model needs none, and is in the units of the record.
+
+        Raises:
+            ImportError: where python-control is not installed.
+            ValueError: no such layer, one without inputs, dead times that are parameters.
+        """
+        return to_control(self, kind, step, draws, layer)
 
     @isolated
     def summary(self, record: Record | None = None) -> Summary:
