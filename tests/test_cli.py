@@ -106,7 +106,7 @@ def test_fit_prints_saves_and_draws(fitted, folder, table):
     names = {path.name for path in (folder / "figures").iterdir()}
     assert names == {
         f"{name}.png"
-        for name in ("record", "poles", "residuals", "history", "starts", "bode",
+        for name in ("record", "poles", "residuals", "quantiles", "history", "starts", "bode",
                      "impulse_response", "simulation", "forecast", "one_step")
     }  # fmt: skip
 
@@ -124,7 +124,7 @@ def test_fit_without_inputs_on_time_stamps(folder, tmp_path):
     )  # fmt: skip
     assert result.exit_code == 0, result.output
     assert "0 inputs ->" in result.stdout
-    assert "5 figures in" in result.stdout
+    assert "6 figures in" in result.stdout
     assert not (tmp_path / "new" / "figures" / "bode.png").exists()
 
 

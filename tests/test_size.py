@@ -17,10 +17,11 @@ LINES = 31_500
 # torch (1640 lines), the filter's kernels and moments of functions in lanes (480 lines), hidden
 # signals (180 lines), dead times with a posterior (1230 lines), simulated plants with feedback
 # (320 lines), the same fit in any unit and order (310 lines), large files (90 lines), draws of all
-# parameters of models with functions (430 lines), kernels by the evidence (270 lines) and readers of
-# files of every kind (900 lines) commands (640 lines) and tables of results (370 lines) and systems for
-# python-control (150 lines) came since. To shrink, and to go.
-LINES_TODAY = 48_850
+# parameters of models with functions (430 lines), kernels by the evidence (270 lines), readers of
+# files of every kind (900 lines), commands (640 lines), tables of results (370 lines), systems for
+# python-control (150 lines) and figures of layers and several models (330 lines) came since. To
+# shrink, and to go.
+LINES_TODAY = 49_150
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

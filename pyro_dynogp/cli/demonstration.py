@@ -105,14 +105,21 @@ def write_figures(
     """
     figures = {
         "record": plotting.record(train),
-        "poles": plotting.pole_map(fit),
         "residuals": plotting.residuals(fit, train),
         "history": plotting.history(fit),
+        "quantiles": plotting.quantiles(fit, train),
         "starts": plotting.starts(fit),
     }
-    if fit.model.inputs:
-        figures["bode"] = plotting.bode(fit)
-        figures["impulse_response"] = plotting.impulse_response(fit)
+    dynamic = [wire.name for wire, layer in fit.system.dynamic]
+    for wire, made in fit.system.dynamic:
+        suffix = "" if len(dynamic) == 1 else f"_{wire.name}"
+        figures[f"poles{suffix}"] = plotting.pole_map(fit, layer=wire.name)
+        if made.modes.inputs:
+            figures[f"bode{suffix}"] = plotting.bode(fit, layer=wire.name)
+            figures[f"impulse_response{suffix}"] = plotting.impulse_response(fit, layer=wire.name)
+    for wire in fit.model.wires:
+        if wire.name not in dynamic:
+            figures[f"function_{wire.name}"] = plotting.static_function(fit, train, wire.name)
     if test is not None:
         shown = train[-max(2, int(SHOWN_PAST * len(test))) :]
         for name, result in (results or {}).items():
