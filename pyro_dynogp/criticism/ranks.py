@@ -88,7 +88,11 @@ def uniformity(
 
 
 def holm(p_values: np.ndarray) -> np.ndarray:
-    """P-values (m,) adjusted for there being m of them (Holm 1979)."""
+    """P-values (m,) adjusted for there being m of them (Holm 1979).
+
+    The same as statsmodels' ``multipletests(method="holm")``, in four lines: users need no
+    statsmodels, whose first import takes 1 s.
+    """
     order = np.argsort(p_values)
     raised = p_values[order] * np.arange(len(p_values), 0, -1)
     out = np.empty_like(p_values)

@@ -1,4 +1,4 @@
-"""Data of other libraries: tables that narwhals reads, MATLAB files, nonlinear_benchmarks."""
+"""Data of other libraries: tables, MATLAB files, nonlinear_benchmarks, holidays."""
 
 from __future__ import annotations
 
@@ -142,3 +142,41 @@ def read_benchmark(data: Any, sampling_time: float | None) -> RecordFields:
         "output_units": None, "time_unit": "s", "extra": {}, "extra_units": {},
         "name": "" if label is None else str(label), "start": None,
     }  # fmt: skip
+
+
+def holidays_of(
+    stamps: pd.DatetimeIndex | None, country: str, subdivision: str | None
+) -> np.ndarray:
+    """1.0 where a local date is a public holiday, else 0.0, shape (n,).
+
+    Args:
+        stamps: in the zone of the plant. country: code such as "AT" (ISO 3166), as of
+            `holidays.country_holidays`. subdivision: of it, such as "BY" of "DE"; None for none.
+
+    Raises:
+        ImportError: where the package holidays is not installed.
+        ValueError: no time stamps, or no such country or subdivision.
+    """
+    if stamps is None:
+        raise invalid(
+            "record", expected="time stamps, whose dates may be holidays", got="plain times"
+        )
+    for argument, value in (("country", country), ("subdivision", subdivision)):
+        if not isinstance(value, str) and not (argument == "subdivision" and value is None):
+            raise invalid(argument, expected='a code such as "AT"', got=repr(value))
+    try:
+        import holidays
+    except ImportError as error:
+        raise ImportError(
+            "with_holidays needs the package holidays: pip install holidays", name="holidays"
+        ) from error
+    years = range(stamps[0].year, stamps[-1].year + 1)
+    try:
+        dates: Any = holidays.country_holidays(country, subdiv=subdivision, years=years)
+    except NotImplementedError as error:
+        argument = "subdivision" if "subdivision" in str(error) else "country"
+        got = repr(subdivision if argument == "subdivision" else country)
+        raise invalid(
+            argument, expected="a code that the package holidays knows", got=f"{got} ({error})"
+        ) from error
+    return np.isin(stamps.date, list(dates)).astype(np.float64)

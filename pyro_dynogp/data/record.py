@@ -15,7 +15,7 @@ import torch
 import xarray as xr
 from numpy.typing import NDArray
 
-from pyro_dynogp.data import clock, writers
+from pyro_dynogp.data import clock, foreign, writers
 from pyro_dynogp.data.checks import (
     Array,
     Names,
@@ -250,6 +250,17 @@ class Record(Sources):
         if name not in self.extra:
             raise invalid("name", expected=f"an extra channel {list(self.extra)}", got=repr(name))
         return self.select(inputs=(*self.input_names, name))
+
+    def with_holidays(
+        self, country: str, subdivision: str | None = None, *, name: str = "holiday"
+    ) -> Record:
+        """The record with an extra channel: 1 on public holidays in its zone, 0 on other days.
+
+        Args: as those of `foreign.holidays_of`; it takes the package holidays.
+            name: of the channel.
+        """
+        column = foreign.holidays_of(self.timestamps, country, subdivision)
+        return dataclasses.replace(self, extra={**self.extra, name: column})
 
     def with_outputs(self, outputs: Any, names: Names = None, units: Names = None) -> Record:
         """Return the same record with other outputs (n, n_y); NaN marks missing samples.

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from scipy.special import ndtri
 from scipy.stats import beta
 
+from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.plotting import style
 from pyro_dynogp.prediction.prediction import Prediction
 from pyro_dynogp.support.errors import instance, invalid
@@ -35,6 +36,7 @@ def static_function(
     Raises:
         ValueError: no such layer, or several where none is named; no such channel; another record.
     """
+    instance("fit", fit, Fitted, "dgp.fit(...) makes one.")
     dynamic = {wire.name for wire, _ in fit.system.dynamic}
     names = [wire.name for wire in fit.model.wires if wire.name not in dynamic]
     if layer is None and len(names) != 1:
@@ -135,6 +137,7 @@ def quantiles(fit: Fit, record: Record) -> Figure:
     Raises:
         ValueError: fewer than ten errors of an output.
     """
+    instance("fit", fit, Fitted, "dgp.fit(...) makes one.")
     errors = fit.innovations(record)
     n_y = errors.shape[1]
     figure, axes = style.panels(1, n_y, width=max(5.4, 4.6 * n_y), height=5.2)

@@ -9,10 +9,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
+from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.lti import views
 from pyro_dynogp.plotting import style
 from pyro_dynogp.plotting.layers import Shown, frequency_grid, shown_layer
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import instance, invalid
 from pyro_dynogp.support.tensors import Numbers
 
 if TYPE_CHECKING:
@@ -162,6 +163,7 @@ def pole_map(fit: Fit, *, layer: str | None = None) -> Figure:
     Raises:
         ValueError: there is no such layer, or several where none is named.
     """
+    instance("fit", fit, Fitted, "dgp.fit(...) makes one.")
     unit = fit.scaling.time_unit
     shown = shown_layer(fit, layer)
     draws, best = np.asarray(shown.draws.poles).ravel(), shown.best
@@ -233,6 +235,7 @@ def _damping_lines(axes: Axes, left: float, top: float) -> None:
 
 
 def _with_inputs(fit: Fit, layer: str | None) -> Shown:
+    instance("fit", fit, Fitted, "dgp.fit(...) makes one.")
     shown = shown_layer(fit, layer) if fit.model.inputs else None
     if shown is None or not shown.draws.inputs:
         raise invalid(

@@ -99,3 +99,38 @@ class TestBenchmarks:
         for step in (0, -1.0, True, "a"):
             with pytest.raises(ValueError, match="sampling_time: expected a positive number"):
                 Record.from_benchmark(data, sampling_time=step)
+
+
+class TestHolidays:
+    def record(self, zone="Europe/Vienna"):
+        stamps = pd.date_range("2023-12-31 12:00", periods=60, freq="6h", tz=zone)
+        return Record(stamps, outputs=np.arange(60.0), extra={"e": np.zeros(60)})
+
+    def test_local_dates(self):
+        pytest.importorskip("holidays")
+        record = self.record().with_holidays("AT")
+        dates = pd.Series(record.timestamps.date.astype(str))
+        # New Year's Day and Epiphany, and no other day from New Year's Eve to 15 January.
+        expected = dates.isin(["2024-01-01", "2024-01-06"]).astype(float)
+        assert record.extra["holiday"].tolist() == expected.tolist()
+        assert list(record.extra) == ["e", "holiday"]
+        assert record.with_extra_as_input("holiday").input_names == ("holiday",)
+        bavaria = self.record().with_holidays("DE", "BY", name="free").extra["free"]
+        assert bavaria.sum() > self.record().with_holidays("DE").extra["holiday"].sum() > 0
+
+    def test_refusals(self, monkeypatch):
+        with pytest.raises(ValueError, match="plain times"):
+            Record([0.0, 1.0]).with_holidays("AT")
+        for country in (None, 3):
+            with pytest.raises(ValueError, match="country: expected"):
+                self.record().with_holidays(country)
+        monkeypatch.setitem(sys.modules, "holidays", None)
+        with pytest.raises(ImportError, match="pip install holidays"):
+            self.record().with_holidays("AT")
+
+    def test_unknown_codes(self):
+        pytest.importorskip("holidays")
+        with pytest.raises(ValueError, match=r"country: .*'XX'"):
+            self.record().with_holidays("XX")
+        with pytest.raises(ValueError, match=r"subdivision: .*'XX'"):
+            self.record().with_holidays("AT", "XX")

@@ -73,6 +73,10 @@ class World:
         return dgp.Modes([-0.5 + 2.0j], [[0.5 + 0.15j]], [1.0], [[0.03]])
 
     @functools.cached_property
+    def stamped(self):
+        return dgp.Record(pd.date_range("2024-01-01", periods=9, tz="UTC"), outputs=np.zeros(9))
+
+    @functools.cached_property
     def frame(self):
         return pd.DataFrame({"t": [0.0, 1.0, 2.0], "u": [1.0, 2.0, 4.0], "y": [0.5, 1.0, 2.0]})
 
@@ -151,6 +155,8 @@ SOURCE = {"inputs": ("v", ["u", "v"], 3), "outputs": ("v", ["y", "v"], 3), "outp
           "time_unit": (3,), "extra": ("v", ["v"], 3), "input_units": (["a", "b"], 3),
           "output_units": (["a", "b"], 3), "extra_units": ({"v": "m"}, 3), "name": (3,),
           "nonsense": (1,)}  # fmt: skip
+AXIS = ("text", [1.0], [1.0, np.nan], 3.0, [[1.0, 2.0]])
+LAYERS = (3, "nonsense", "y")
 VARIATIONAL = {"draws": COUNT, "particles": COUNT, "learning_rate": POSITIVE}
 
 
@@ -255,6 +261,8 @@ TABLE: dict[str, Entry] = {
     "Record.from_benchmark": Entry(lambda w: dgp.Record.from_benchmark,
         lambda w: {"data": types.SimpleNamespace(u=[1.0, 2.0], y=[1.0, 2.0]), "sampling_time": 1},
         {"data": (None, 3, "text"), "sampling_time": (0, -1.0, np.nan, "a", True, [1.0])}),
+    "Record.with_holidays": Entry(lambda w: w.stamped.with_holidays, lambda w: {"country": "AT"},
+        {"country": (3, None), "subdivision": (3,)}, free=("name",), late=True),
     "Scaling": Entry(lambda w: dgp.Scaling.from_records, lambda w: {"records": w.record},
                      {"records": RECORD}),
     "Prediction": Entry(lambda w: w.prediction.quantile, lambda w: {"q": 0.5},
@@ -399,6 +407,22 @@ TABLE: dict[str, Entry] = {
         {"system": (None, 3, "a"), "time": (None, "text", [1.0, 0.0]), "inputs": ("text",)}),
     "LTIParameters": Entry(lambda w: dgp.LTIParameters, lambda w: {"modes": w.modes},
                            {"modes": (None, 3, "a")}),
+    "plotting.bode": Entry(lambda w: plotting.bode, lambda w: {"fit": w.fit},
+        {"fit": (None, 3), "omega": (*AXIS, [0.0, 1.0]), "layer": LAYERS}),
+    "plotting.impulse_response": Entry(lambda w: plotting.impulse_response,
+        lambda w: {"fit": w.fit}, {"fit": (None, 3), "time": AXIS, "layer": LAYERS}),
+    "plotting.pole_map": Entry(lambda w: plotting.pole_map, lambda w: {"fit": w.fit},
+        {"fit": (None, 3), "layer": LAYERS}),
+    "plotting.static_function": Entry(lambda w: plotting.static_function,
+        lambda w: {"fit": w.bent, "record": w.record},
+        {"fit": (None, 3), "record": foreign, "layer": LAYERS, "channel": (*NUMBER, 1, None)}),
+    "plotting.compare": Entry(lambda w: plotting.compare,
+        lambda w: {"predictions": {"a": w.prediction}, "record": w.record},
+        {"predictions": (None, 3, {}, {"a": 3}), "record": unlike,
+         "skip": (-1, 60, 1.5, "a", None, True)}),
+    "plotting.quantiles": Entry(lambda w: plotting.quantiles,
+        lambda w: {"fit": w.fit, "record": w.record},
+        {"fit": (None, 3), "record": lambda w: [*measured(w), w.record[:9]]}),
     "datasets": plain(datasets.load, {"name": (*NAME, None), "nonsense": (1,)}, free=("options",),
                       name="gas_furnace"),
 }  # fmt: skip
