@@ -239,7 +239,7 @@ def test_warnings_of_a_fit_are_notes(folder, tmp_path):
     assert result.exit_code == 0, result.output
     said = [line for line in result.stderr.splitlines() if "not to be trusted" in line]
     assert len(said) == 1
-    assert said[0].startswith("Note: ")
+    assert said[0].startswith("Note: layer g: ")
     result = run("simulate", model, tmp_path / "ramp.csv", "--sampling-time", 1, "--out", "-")
     assert "not to be trusted" in result.stderr
 

@@ -88,7 +88,7 @@ def notes() -> Iterator[None]:
             if category is not UserWarning:
                 before(message, category, filename, lineno, file, line)
                 return
-            text = in_flags(str(message))
+            text = in_flags(str(message).removeprefix("fit: "))
             if text not in told:
                 told.add(text)
                 click.echo(f"Note: {text}", err=True)

@@ -32,9 +32,9 @@ class Summary(str):
         return str(self)
 
     def _repr_html_(self) -> str:
-        tables = [self.table.map(_cell).to_html(border=0)]
+        tables = [self.table.map(_cell).rename_axis(None).to_html(border=0)]
         if self.scores is not None:
-            tables.append(self.scores.map(_cell).to_html(border=0))
+            tables.append(self.scores.map(_cell).rename_axis(None).to_html(border=0))
         return preformatted(self.head) + "".join(tables)
 
 
@@ -43,8 +43,8 @@ def summarise(fit: Fitted, record: Record | None) -> Summary:
     before, after = summary(fit)
     table = parameter_table(fit)
     scored = None if record is None else _scored(fit, record)
-    parts = [before, table.map(_cell).to_string()]
-    parts += [] if scored is None else [scored.map(_cell).to_string()]
+    parts = [before, table.map(_cell).rename_axis(None).to_string()]
+    parts += [] if scored is None else [scored.map(_cell).rename_axis(None).to_string()]
     made = Summary("\n".join([*parts, *([after] if after else [])]))
     made.table, made.scores = table, scored
     made.head = "\n".join(part for part in (before, after) if part)

@@ -11,6 +11,7 @@ from scipy.special import ndtri
 from scipy.stats import beta
 
 from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.plotting import style
 from pyro_dynogp.prediction.prediction import Prediction
 from pyro_dynogp.support.errors import instance, invalid
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from pyro_dynogp.fitting import Fit
 
 
+@isolated
 def static_function(
     fit: Fit, record: Record, layer: str | None = None, *, channel: int = 0
 ) -> Figure:
@@ -73,6 +75,7 @@ def static_function(
     return figure
 
 
+@isolated
 def compare(predictions: Mapping[str, Prediction], record: Record, *, skip: int = 0) -> Figure:
     """Predictions of several models on one record: means with 95 % bands, residuals below.
 
@@ -124,6 +127,7 @@ def compare(predictions: Mapping[str, Prediction], record: Record, *, skip: int 
     return figure
 
 
+@isolated
 def quantiles(fit: Fit, record: Record) -> Figure:
     """Quantiles of the standardised one-step errors against those of the normal distribution.
 

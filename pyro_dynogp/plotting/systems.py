@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
 from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.lti import views
 from pyro_dynogp.plotting import style
 from pyro_dynogp.plotting.layers import Shown, frequency_grid, shown_layer
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 DAMPING_LINES = (0.05, 0.1, 0.2, 0.4, 0.7)
 
 
+@isolated
 def impulse_response(fit: Fit, time: Numbers | None = None, *, layer: str | None = None) -> Figure:
     """Response of each output to a unit impulse of each input, with credible bands.
 
@@ -77,6 +79,7 @@ def impulse_response(fit: Fit, time: Numbers | None = None, *, layer: str | None
     return figure
 
 
+@isolated
 def bode(fit: Fit, omega: Numbers | None = None, *, layer: str | None = None) -> Figure:
     """Magnitude and phase of the transfer function from each input to each output, with bands.
 
@@ -149,6 +152,7 @@ def bode(fit: Fit, omega: Numbers | None = None, *, layer: str | None = None) ->
     return figure
 
 
+@isolated
 def pole_map(fit: Fit, *, layer: str | None = None) -> Figure:
     """Poles in the upper left half of the complex plane, with lines of constant damping.
 
