@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from pyro_dynogp.criticism import inference_data
+from pyro_dynogp.criticism.told import Told
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference import storage
 from pyro_dynogp.inference.fitted import Fitted, known_fit
@@ -18,7 +18,6 @@ from pyro_dynogp.inference.methods.base import Method, Problem
 from pyro_dynogp.inference.methods.choose import method_of
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.stability import warnings_of
-from pyro_dynogp.inference.summary import summary
 from pyro_dynogp.inference.training import train_model
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.outputs import output_process
@@ -33,7 +32,7 @@ from pyro_dynogp.support.errors import instance, invalid, warn
 __all__ = ["Fit", "fit", "load"]
 
 
-class Fit(Fitted):
+class Fit(Told):
     """A fitted model, and what can be done with it.
 
     The attributes are those of `Fitted`.
@@ -142,60 +141,6 @@ class Fit(Fitted):
                 its own: a file holds numbers, no code.
         """
         storage.save(self, path)
-
-    @isolated
-    def to_arviz(
-        self,
-        *,
-        future: Record | None = None,
-        samples: int = 200,
-        prior_samples: int = 200,
-        seed: int = 0,
-    ) -> Any:
-        """The fit as ArviZ's InferenceData, for `arviz` plots, tables and files.
-
-        Groups:
-
-        - posterior: every latent site (chain, draw, *shape), in scaled units (``delay`` in units of
-          time); trajectories where
-          the guide had them; and in physical units decay rate, frequency and time constant of each
-          pole, gains of a linear model, scale of the measurement noise and offset of the outputs.
-          Chains are those of NUTS, else one; "map" has one draw.
-        - prior, prior_predictive: the same sites and quantities from the prior, outputs at them;
-          left out with ``priors="paper"``, whose draws exceed floating-point range.
-        - posterior_predictive: replicated outputs of the training record, jointly, from its inputs
-          alone, at draws spread evenly over all of them.
-        - predictions, predictions_constant_data: forecast of `future` after the last training
-          record, on its own clock.
-        - log_likelihood: one-step-ahead density of each output, trajectories integrated out [nats];
-          they add up to `log_likelihood`, NaN where an output is missing. Do not give them to
-          ``az.loo``: they are not independent given the draw. `pyro_dynogp.loo` is for that.
-        - sample_stats: ``lp``, log p(y, values) of each draw; of a variational posterior ``log_q``
-          and, in attrs, the Pareto shape of their ratios; what `diagnostics` holds, in attrs.
-        - observed_data ``y`` and constant_data: inputs ``u``, and ``elbo`` ("svi") or ``log_joint``
-          by step.
-
-        Several records give ``y_0``, ``y_1``, ... over ``time_0``, ``time_1``, ...; times are UTC
-        time stamps where the record has them. Units are in attrs of the variables and in the
-        labels ``input_unit`` and ``output_unit``.
-
-        Args:
-            future: a later record with inputs; its outputs are not used.
-            samples: number of replicates and of forecasts. prior_samples: of prior draws, 0 for
-                none. seed: for all of them.
-
-        Raises:
-            ValueError: on numbers that make no sense, a `future` that does not follow the last
-                training record or has other channels, and layers named as a dimension is.
-        """
-        return inference_data.to_arviz(
-            self, future=future, samples=samples, prior_samples=prior_samples, seed=seed
-        )
-
-    @isolated
-    def summary(self) -> str:
-        """A few lines: what was fitted, how well it went, the modes at the best optimum."""
-        return summary(self)
 
 
 @isolated

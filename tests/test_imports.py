@@ -56,6 +56,8 @@ def sources():
     found = {}
     for path in (ROOT / PACKAGE).rglob("*.py"):
         parts = path.relative_to(ROOT / PACKAGE).with_suffix("").parts
+        if parts == ("__main__",):  # calls the command line, and nothing imports it
+            continue
         found[".".join(p for p in parts if p != "__init__")] = path.read_text()
     return found
 

@@ -19,9 +19,11 @@ LINES = 31_500
 # (320 lines), the same fit in any unit and order (310 lines), large files (90 lines), draws of all
 # parameters of models with functions (430 lines) and kernels by the evidence (270 lines), one
 # order of channels (120 lines), files that are written whole (80 lines), checks of what readers
-# are given (90 lines), steps (110 lines) and examples in the docstrings of all public names (350
+# are given (90 lines), steps (110 lines), examples in the docstrings of all public names (350
+# lines), readers of files of every kind (900 lines), commands (640 lines), tables of results (370
+# lines), systems for python-control (150 lines) and figures of layers and several models (330
 # lines) came since. To shrink, and to go.
-LINES_TODAY = 47_640
+LINES_TODAY = 50_100
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

@@ -1,4 +1,4 @@
-"""Command line: pyro-dynogp demo, info, fit, simulate, close-loop, compile.
+"""Command line: fit, simulate, forecast, check, compare, close-loop, and what helps with them.
 
 Torch and Pyro are imported inside the commands, so that ``--help`` need not wait for them.
 """
@@ -12,9 +12,14 @@ import click
 
 from pyro_dynogp.cli.close_loop import close_loop
 from pyro_dynogp.cli.compilation import compile_now
-from pyro_dynogp.cli.data import Clock, Columns, InvalidInput, record_for, training_and_test
+from pyro_dynogp.cli.criticism import check, compare
+from pyro_dynogp.cli.data import InvalidInput, training_and_test
+from pyro_dynogp.cli.example import example
 from pyro_dynogp.cli.files import check_folder, saved
-from pyro_dynogp.cli.options import CHANNELS, CLOCK, PAIRS, WORK, seed
+from pyro_dynogp.cli.messages import in_flags, notes
+from pyro_dynogp.cli.models import KINDS, MODELS, made, tell_method
+from pyro_dynogp.cli.options import CHANNELS, PAIRS, READING, WORK, Modelled, seed
+from pyro_dynogp.cli.predictions import forecast, simulate
 
 
 class _Group(click.Group):
@@ -22,11 +27,12 @@ class _Group(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
-            return super().invoke(ctx)
+            with notes():
+                return super().invoke(ctx)
         except ValueError as error:
             if not _from_package(error):
                 raise
-            raise InvalidInput(" ".join(str(error).split())) from error
+            raise InvalidInput(in_flags(str(error))) from error
         except OSError as error:
             if error.filename is None and not _from_package(error):
                 raise
@@ -54,10 +60,12 @@ def main() -> None:
     \b
     Examples:
       pyro-dynogp demo
+      pyro-dynogp example gas_furnace
       pyro-dynogp info plant.csv
       pyro-dynogp fit plant.csv --input valve --output level --sampling-time 0.5 \\
           --train 800 --save plant.safetensors --figures figures
       pyro-dynogp simulate plant.safetensors next_week.csv --sampling-time 0.5 --out level.csv
+      pyro-dynogp check plant.safetensors
       pyro-dynogp close-loop plant.csv --input valve --output level --sampling-time 0.5
 
     Exit codes: 0 done, 1 unexpected error, 2 input that has to be put right.
@@ -91,7 +99,8 @@ def demo(directory: Path, quiet: bool) -> None:
 
 @main.command()
 @click.argument("subject", metavar="[DATASET_OR_FILE]", required=False)
-def info(subject: str | None) -> None:
+@READING
+def info(subject: str | None, **layout: Any) -> None:
     """Tell versions and shipped data sets, or about one data set, CSV file or saved fit.
 
     \b
@@ -103,7 +112,7 @@ def info(subject: str | None) -> None:
     """  # noqa: D301
     from pyro_dynogp.cli.describe import tell
 
-    tell(subject)
+    tell(subject, layout)
 
 
 @main.command()
@@ -112,14 +121,20 @@ def info(subject: str | None) -> None:
 @click.option(
     "--train", type=click.IntRange(min=2), metavar="N", help="Train on the first N samples alone."
 )
+@click.option(
+    "--model", "kind", type=click.Choice(list(MODELS)), default="linear", show_default=True,
+    help=f"In this order: {KINDS}",
+)  # fmt: skip
 @PAIRS
 @click.option(
-    "--method", type=click.Choice(["map", "svi", "nuts"]), default="map", show_default=True,
-    help="Posterior mode; variational posterior; Hamiltonian Monte Carlo.",
+    "--method", type=click.Choice(["default", "map", "svi", "nuts"]), default="default",
+    show_default=True,
+    help="Draws of all parameters by importance sampling; posterior mode alone (fast, bands too "
+    "narrow); variational posterior; Hamiltonian Monte Carlo.",
 )  # fmt: skip
 @click.option(
-    "--restarts", type=click.IntRange(min=1), default=6, show_default=True,
-    help="Number of points from which the optimum is sought.",
+    "--restarts", type=click.IntRange(min=1), metavar="N",
+    help="Number of points from which the optimum is sought [the model's default].",
 )  # fmt: skip
 @click.option("--steps", type=click.IntRange(min=1), metavar="N", help="Most iterations.")
 @seed("fit")
@@ -135,18 +150,17 @@ def info(subject: str | None) -> None:
 def fit(
     data: str,
     train: int | None,
-    pairs: int,
-    method: Any,
-    restarts: int,
+    method: str,
+    restarts: int | None,
     steps: int | None,
     seed: int,
     save: Path | None,
     figures: Path | None,
     workers: int | None,
     quiet: bool,
-    **columns: Unpack[Columns],
+    **columns: Unpack[Modelled],
 ) -> None:
-    """Fit a linear dynamic Gaussian process to DATA, a CSV file or the name of a data set.
+    """Fit a model to DATA, a CSV file or the name of a data set.
 
     Prints the fit, and the scores of predictions of the samples that training left out (those
     after --train; a data set has its own test samples).
@@ -155,7 +169,8 @@ def fit(
     Examples:
       pyro-dynogp fit plant.csv --input valve --input pump --output level \\
           --time stamp --timezone Europe/Vienna --train 800 --save plant.safetensors
-      pyro-dynogp fit gas_furnace --pairs 3 --method svi --figures figures
+      pyro-dynogp fit gas_furnace --pairs 3 --figures figures
+      pyro-dynogp fit coupled_drives --model wiener --pairs 2 --save drives.safetensors
     """  # noqa: D301
     import pyro_dynogp as dgp
     from pyro_dynogp.cli import demonstration as report
@@ -167,11 +182,11 @@ def fit(
         check_folder("--figures", figures / "record.png")
     parts = training_and_test(data, columns, train)
     first, test = parts.train[0], parts.test
-    model = dgp.LinearDynamicGP(inputs=first.n_inputs, outputs=first.n_outputs, pairs=pairs)
+    model = made(columns["kind"], first.n_inputs, first.n_outputs, columns["pairs"])
     fitted = dgp.fit(
         model,
         first if len(parts.train) == 1 else parts.train,
-        method=method,
+        method=None if method == "default" else method,
         seed=seed,
         restarts=restarts,
         steps=steps,
@@ -179,6 +194,7 @@ def fit(
         progress=not quiet,
     )
     click.echo(fitted.summary())
+    tell_method(fitted)
     if save is not None:
         click.echo(f"saved to {saved(fitted.save, save)}")
     results = None
@@ -195,63 +211,7 @@ def fit(
         click.echo(f"{len(written)} figures in {figures}")
 
 
-@main.command()
-@click.argument("model", type=click.Path(exists=True, dir_okay=False, path_type=Path))
-@click.argument("data")
-@CLOCK
-@click.option(
-    "--out", required=True, type=click.Path(dir_okay=False, path_type=Path), metavar="CSV",
-    help="Write mean, standard deviation and 95 % interval here; - for standard output.",
-)  # fmt: skip
-@click.option("--no-process-noise", is_flag=True, help="Simulate the deterministic system.")
-@click.option(
-    "--horizon", type=click.IntRange(min=1), metavar="K",
-    help="Predict K samples ahead from measured outputs instead.",
-)  # fmt: skip
-def simulate(
-    model: Path,
-    data: str,
-    out: Path,
-    no_process_noise: bool,
-    horizon: int | None,
-    **clock: Unpack[Clock],
-) -> None:
-    """Simulate the outputs of a saved MODEL from the inputs in DATA.
-
-    DATA is a CSV file with the columns of the training record, taken to be in the same units, or
-    the name of a data set (its test record). Outputs are read where there are any, and used with
-    --horizon alone.
-
-    \b
-    Examples:
-      pyro-dynogp simulate plant.safetensors next_week.csv --sampling-time 0.5 --out level.csv
-      pyro-dynogp simulate plant.safetensors next_week.csv --sampling-time 0.5 --horizon 10 --out -
-    """  # noqa: D301
-    if horizon is not None and no_process_noise:
-        raise InvalidInput("--no-process-noise: for simulations; leave it out with --horizon.")
-    check_folder("--out", out)
-    from pyro_dynogp import load
-    from pyro_dynogp.support.writing import write_result
-
-    fitted = load(model)
-    record, has_outputs = record_for(fitted, data, clock)
-    if horizon is None:
-        prediction = fitted.simulate(record, process_noise=not no_process_noise)
-    elif has_outputs:
-        prediction = fitted.predict(record, horizon=horizon)
-    else:
-        raise InvalidInput(
-            f"--horizon: needs the measured outputs {list(fitted.scaling.output_names)} in {data}."
-        )
-    frame = prediction.to_frame()
-    if record.timestamps is not None:
-        frame.index = record.timestamps.map(lambda stamp: stamp.isoformat()).rename("time")
-    if str(out) == "-":
-        click.echo(frame.to_csv(), nl=False)
-    else:
-        there = saved(lambda path: write_result(path, frame.to_csv, "The table"), out)
-        click.echo(f"{len(frame)} rows in {there}")
-
-
-main.add_command(close_loop)
-main.add_command(compile_now)
+for _command in (
+    simulate, forecast, check, compare, close_loop, example, compile_now
+):  # fmt: skip
+    main.add_command(_command)

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Unpack
+from typing import TYPE_CHECKING, Unpack
 
 import click
 
-from pyro_dynogp.cli.data import Columns, InvalidInput, whole_record
+from pyro_dynogp.cli.data import InvalidInput, whole_record
 from pyro_dynogp.cli.files import check_folder, saved
-from pyro_dynogp.cli.options import CHANNELS, PAIRS, WORK, seed
+from pyro_dynogp.cli.models import MODELS, loaded, made
+from pyro_dynogp.cli.options import CHANNELS, PAIRS, WORK, Columns, seed
+
+if TYPE_CHECKING:
+    from pyro_dynogp.fitting import Fit
 
 
 @click.command(name="close-loop")
@@ -21,8 +25,9 @@ from pyro_dynogp.cli.options import CHANNELS, PAIRS, WORK, seed
     "All other columns of numbers if not given.",
 )  # fmt: skip
 @click.option(
-    "--model", "kind", type=click.Choice(["linear", "wiener"]), default="linear",
-    show_default=True, help="Linear dynamics; or linear dynamics, then a static function.",
+    "--model", "kind", default="linear", show_default=True, metavar="NAME|FILE",
+    help=f"A model to fit to the first half: {', '.join(MODELS)}. Or a saved fit, of the beginning "
+    "of DATA, whose channels need not be named again.",
 )  # fmt: skip
 @PAIRS
 @click.option(
@@ -49,7 +54,7 @@ def close_loop(
     data: str,
     candidates: tuple[str, ...],
     kind: str,
-    pairs: int,
+    pairs: int | None,
     restarts: int | None,
     max_rounds: int,
     time_limit: float | None,
@@ -71,10 +76,12 @@ def close_loop(
       pyro-dynogp close-loop plant.csv --input valve --output level --sampling-time 0.5
       pyro-dynogp close-loop plant.csv --input valve --output level --time stamp \\
           --candidates ambient --candidates feed --pairs 3 --out report
+      pyro-dynogp close-loop plant.csv --model plant.safetensors --sampling-time 0.5
     """  # noqa: D301
-    record, left_out = whole_record(data, columns, candidates)
     import pyro_dynogp as dgp
 
+    given = _saved(kind, pairs, restarts)
+    record, left_out = whole_record(data, columns, candidates, given)
     settings = dgp.LoopSettings()
     fewest = 4 * settings.block_samples
     if len(record) < fewest:
@@ -83,9 +90,8 @@ def close_loop(
     check_folder("--out", out / "report.html")
     if left_out:
         click.echo(f"Left out, as they hold no numbers: {', '.join(left_out)}", err=True)
-    made = dgp.LinearDynamicGP if kind == "linear" else dgp.Wiener
-    fitted = dgp.fit(
-        made(inputs=record.n_inputs, outputs=record.n_outputs, pairs=pairs),
+    fitted = given or dgp.fit(
+        made(kind, record.n_inputs, record.n_outputs, pairs),
         record[: len(record) // 2],
         seed=seed,
         restarts=restarts,
@@ -111,3 +117,15 @@ def close_loop(
     which = "the model before" if report.model_kept else "the extended model"
     which = which if report.extended is not report.base else "the model as given"
     click.echo(f"Model:  {model} ({which}; pyro_dynogp.load reads it)")
+
+
+def _saved(kind: str, pairs: int | None, restarts: int | None) -> Fit | None:
+    """The fit that a file holds; None where a model is named."""
+    if kind in MODELS:
+        return None
+    if not Path(kind).is_file():
+        raise InvalidInput(f"--model: {kind} is neither a file nor one of {', '.join(MODELS)}.")
+    for name, value in (("--pairs", pairs), ("--restarts", restarts)):
+        if value is not None:
+            raise InvalidInput(f"{name}: for models that are fitted; leave it out with a file.")
+    return loaded(Path(kind))

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from pyro_dynogp.cli.options import LAYOUT, Clock, Columns
+
 if TYPE_CHECKING:
     from pyro_dynogp.data.record import Record
+    from pyro_dynogp.data.text_table import TextTable
     from pyro_dynogp.examples.datasets import Dataset
     from pyro_dynogp.fitting import Fit
 
@@ -32,23 +36,6 @@ class InvalidInput(click.ClickException):
     """Input that a user can put right: one line, exit code 2."""
 
     exit_code = 2
-
-
-class Clock(TypedDict):
-    """Options about time, as in `Record.from_csv`."""
-
-    time: str | None
-    sampling_time: float | None
-    timezone: str | None
-    time_unit: str | None
-
-
-class Columns(Clock):
-    """What the columns of DATA are: names, NAME=UNIT of some of them, and the clock."""
-
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    units: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -101,7 +88,7 @@ def training_and_test(data: str, columns: Columns, train: int | None) -> Parts:
         raise InvalidInput(
             f"--output: name one output column or more; pyro-dynogp info {path} lists the columns."
         )
-    known = _units(columns["units"], (*inputs, *outputs))
+    known = _units(path, columns, (*inputs, *outputs))
     record = _from_csv(
         path,
         inputs,
@@ -116,21 +103,31 @@ def training_and_test(data: str, columns: Columns, train: int | None) -> Parts:
     return Parts((before,), after, follows=True)
 
 
-def record_for(fitted: Fit, data: str, clock: Clock) -> tuple[Record, bool]:
+def table_of(path: Path, options: Mapping[str, Any]) -> TextTable:
+    """The columns of a file, as the options say that it is written."""
+    from pyro_dynogp.data.text_layout import Layout
+    from pyro_dynogp.data.text_table import read_table
+
+    return read_table(path, Layout(**{name: options[name] for name in LAYOUT}))
+
+
+def record_for(fitted: Fit, data: str, clock: Clock, *, whole: bool = False) -> tuple[Record, bool]:
     """Record with the channels of a fit, and whether its outputs were measured.
 
     Args:
         fitted: the fit, in whose units the columns of a file are taken to be.
         data: file or name of a data set. clock: options of `Record.from_csv` about time.
+        whole: of a data set the whole record, not the test alone.
     """
-    from pyro_dynogp.data.text_table import read_table
-
     scaling = fitted.scaling
     if data in DATASETS:
         _refuse(data, clock)
-        return _selected(data, scaling.input_names, scaling.output_names).test, True
+        dataset = _selected(data, scaling.input_names, scaling.output_names)
+        if whole and dataset.full is None:
+            raise InvalidInput(f"{data}: is not one record to forecast a part of.")
+        return (dataset.full or dataset.test) if whole else dataset.test, True
     path = existing(data)
-    columns = read_table(path, None, None, None, None, "utf-8-sig").columns
+    columns = table_of(path, clock).columns
     measured = all(name in columns for name in scaling.output_names)
     record = _from_csv(
         path,
@@ -144,17 +141,20 @@ def record_for(fitted: Fit, data: str, clock: Clock) -> tuple[Record, bool]:
 
 
 def whole_record(
-    data: str, columns: Columns, candidates: tuple[str, ...]
+    data: str, columns: Columns, candidates: tuple[str, ...], fitted: Fit | None = None
 ) -> tuple[Record, tuple[str, ...]]:
     """Read a CSV file or a data set with the channels that a model does not use.
 
     Args:
         data: file or name. columns: what its columns are.
         candidates: columns to keep as extra channels; none named for all that hold numbers.
+        fitted: a saved fit, whose channels and units the record is to have.
 
     Returns:
         The record, and the columns left out since they hold text or nothing.
     """
+    if fitted is not None:
+        columns = _as_fitted(fitted, data, columns)
     inputs, outputs = columns["inputs"], columns["outputs"]
     if twice := set(candidates) & {*inputs, *outputs}:
         raise InvalidInput(f"--candidates: {sorted(twice)} are inputs or outputs already.")
@@ -175,8 +175,8 @@ def whole_record(
             f"--output: name one output column or more; pyro-dynogp info {path} lists the columns."
         )
     used = (*inputs, *outputs, columns["time"])
-    extra, left_out = (candidates, ()) if candidates else _numeric(path, used)
-    known = _units(columns["units"], (*inputs, *outputs, *extra))
+    extra, left_out = (candidates, ()) if candidates else _numeric(path, used, columns)
+    known = _units(path, columns, (*inputs, *outputs, *extra))
     record = _from_csv(
         path,
         inputs,
@@ -190,13 +190,37 @@ def whole_record(
     return record, left_out
 
 
-def _numeric(path: Path, used: tuple[str | None, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _as_fitted(fitted: Fit, data: str, columns: Columns) -> Columns:
+    """Options with the channels of a fit, which need not be named again."""
+    scaling = fitted.scaling
+    for option, own, given in (
+        ("inputs", scaling.input_names, columns["inputs"]),
+        ("outputs", scaling.output_names, columns["outputs"]),
+    ):
+        if given and set(given) != set(own):
+            raise InvalidInput(
+                f"--{option[:-1]}: the saved fit has the {option} {list(own)}, got {list(given)}."
+            )
+    changed: Columns = {**columns, "inputs": scaling.input_names, "outputs": scaling.output_names}
+    if data in DATASETS:
+        return changed
+    units = (*scaling.input_units, *scaling.output_units)
+    names = (*scaling.input_names, *scaling.output_names)
+    own_units = tuple(f"{name}={unit}" for name, unit in zip(names, units, strict=True))
+    return {
+        **changed,
+        "units": (*own_units, *columns["units"]),
+        "time_unit": columns["time_unit"] or scaling.time_unit,
+    }
+
+
+def _numeric(
+    path: Path, used: tuple[str | None, ...], options: Mapping[str, Any]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Other columns of a file: those that hold numbers, and those that hold text or nothing."""
     import numpy as np
 
-    from pyro_dynogp.data.text_table import read_table
-
-    table = read_table(path, None, None, None, None, "utf-8-sig")
+    table = table_of(path, options)
     kept: list[str] = []
     left_out: list[str] = []
     for name in table.columns:
@@ -220,19 +244,21 @@ def _from_csv(
 ) -> Record:
     from pyro_dynogp.data.record import Record
 
+    stated: Mapping[str, Any] = clock
     # The reader complains likewise, but in terms of Python arguments.
     if (clock["time"] is None) == (clock["sampling_time"] is None):
         raise InvalidInput("--time COLUMN or --sampling-time S: give one of the two.")
     return Record.from_csv(
         path, inputs, outputs, extra=extra, time=clock["time"],
         sampling_time=clock["sampling_time"], timezone=clock["timezone"],
-        time_unit=clock["time_unit"] or "s", **units,
+        time_unit=clock["time_unit"], **units, **{name: stated[name] for name in LAYOUT},
     )  # fmt: skip
 
 
-def _units(pairs: tuple[str, ...], names: tuple[str, ...]) -> dict[str, str]:
-    units = {}
-    for pair in pairs:
+def _units(path: Path, columns: Columns, names: tuple[str, ...]) -> dict[str, str]:
+    """Units of the columns that are read: those of the file's row of units, or as stated."""
+    units = dict(table_of(path, columns).units)
+    for pair in columns["units"]:
         name, mark, unit = pair.partition("=")
         if not mark or name not in names:
             raise InvalidInput(
@@ -244,9 +270,9 @@ def _units(pairs: tuple[str, ...], names: tuple[str, ...]) -> dict[str, str]:
 
 def _refuse(data: str, options: Clock | Columns) -> None:
     """Refuse what only a file needs."""
-    for name in ("time", "sampling_time", "timezone", "time_unit", "units"):
+    for name in ("time", "sampling_time", "timezone", "time_unit", "units", *LAYOUT):
         if options.get(name):
-            option = name.replace("_", "-").removesuffix("s")
+            option = "unit" if name == "units" else name.replace("_", "-")
             raise InvalidInput(
                 f"--{option}: for CSV files; the data set {data} has its own clock and units."
             )

@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from pyro_dynogp import plotting
+from pyro_dynogp.cli.tables import aligned
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.examples import datasets
 from pyro_dynogp.fitting import Fit, fit
@@ -72,18 +73,17 @@ def score_table(results: Mapping[str, Result], test: Record) -> str:
         "forecast": "forecast from the end of training",
         "one-step": "one-step-ahead prediction",
     }
-    heads = ("rmse", "mae", "fit [%]", "CRPS", "95 % band holds [%]")
-    lines = [f"{'':<36}{'output':<12}" + "".join(f"{h:>{max(9, len(h) + 2)}}" for h in heads)]
+    rows = [("", "output", "rmse", "mae", "fit [%]", "CRPS", "95 % band holds [%]")]
     for name, result in results.items():
         for a, output in enumerate(test.output_names):
             unit = test.output_units[a]
             values = {key: float(np.atleast_1d(x)[a]) for key, x in result.scores.items()}
-            lines.append(
-                f"{what[name]:<36}{plotting.named(output, unit):<12}"
-                f"{values['rmse']:>9.4g}{values['mae']:>9.4g}{values['fit_percent']:>9.1f}"
-                f"{values['crps']:>9.4g}{100 * values['coverage_95']:>21.1f}"
-            )
-    return "\n".join(lines)
+            numbers = (
+                f"{values['rmse']:.4g}", f"{values['mae']:.4g}", f"{values['fit_percent']:.1f}",
+                f"{values['crps']:.4g}", f"{100 * values['coverage_95']:.1f}",
+            )  # fmt: skip
+            rows.append((what[name], plotting.named(output, unit), *numbers))
+    return aligned(rows, left=2)
 
 
 def _draw(figure: Figure, path: Path) -> None:
@@ -112,14 +112,21 @@ def write_figures(
     """
     figures = {
         "record": plotting.record(train),
-        "poles": plotting.pole_map(fit),
         "residuals": plotting.residuals(fit, train),
         "history": plotting.history(fit),
+        "quantiles": plotting.quantiles(fit, train),
         "starts": plotting.starts(fit),
     }
-    if fit.model.inputs:
-        figures["bode"] = plotting.bode(fit)
-        figures["impulse_response"] = plotting.impulse_response(fit)
+    dynamic = [wire.name for wire, layer in fit.system.dynamic]
+    for wire, made in fit.system.dynamic:
+        suffix = "" if len(dynamic) == 1 else f"_{wire.name}"
+        figures[f"poles{suffix}"] = plotting.pole_map(fit, layer=wire.name)
+        if made.modes.inputs:
+            figures[f"bode{suffix}"] = plotting.bode(fit, layer=wire.name)
+            figures[f"impulse_response{suffix}"] = plotting.impulse_response(fit, layer=wire.name)
+    for wire in fit.model.wires:
+        if wire.name not in dynamic:
+            figures[f"function_{wire.name}"] = plotting.static_function(fit, train, wire.name)
     if test is not None:
         shown = train[-max(2, int(SHOWN_PAST * len(test))) :]
         for name, result in (results or {}).items():

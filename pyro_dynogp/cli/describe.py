@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import platform
+from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import click
 
-from pyro_dynogp.cli.data import DATASETS, existing
+from pyro_dynogp.cli.data import DATASETS, existing, table_of
+from pyro_dynogp.cli.tables import aligned
 
 PACKAGES = ("torch", "pyro-ppl", "gpytorch", "numpy", "scipy", "numba", "pandas", "matplotlib")
 
 
-def tell(subject: str | None) -> None:
+def tell(subject: str | None, layout: Mapping[str, Any]) -> None:
     """Print about the package, or about one data set, saved fit or CSV file."""
     if subject is None:
         _tell_versions()
@@ -23,7 +25,7 @@ def tell(subject: str | None) -> None:
     elif _is_safetensors(existing(subject)):
         _tell_fit(Path(subject))
     else:
-        _tell_columns(Path(subject))
+        _tell_columns(Path(subject), layout)
 
 
 def _tell_versions() -> None:
@@ -69,25 +71,26 @@ def _tell_fit(path: Path) -> None:
         click.echo(f"{name}: {value:.6g}")
 
 
-def _tell_columns(path: Path) -> None:
+def _tell_columns(path: Path, layout: Mapping[str, Any]) -> None:
     import numpy as np
 
-    from pyro_dynogp.data.text_table import read_table
-
-    table = read_table(path, None, None, None, None, "utf-8-sig")
+    table = table_of(path, layout)
     click.echo(f"{path}: {len(table.lines)} rows, {len(table.columns)} columns")
-    heads = "".join(f"{head:>13}" for head in ("min", "mean", "max", "missing"))
-    click.echo(f"{'column':<24}{'holds':<13}{heads}")
+    rows: list[tuple[str, ...]] = [("column", "holds", "unit", "min", "mean", "max", "missing")]
+    texts = []
     for name, cells in table.columns.items():
+        unit = table.units.get(name, "-")
         try:
             values = table.numbers(name)
         except ValueError:  # a cell that is no number: a column of stamps or of text
-            click.echo(f"{name:<24}{_kind_of_text(table, name):<13}  {cells[0]} ... {cells[-1]}")
+            rows.append((name, _kind_of_text(table, name), unit, "", "", "", ""))
+            texts.append(f"{name}: {cells[0]} ... {cells[-1]}")
             continue
         seen = values[np.isfinite(values)]
         numbers = (seen.min(), seen.mean(), seen.max()) if len(seen) else (np.nan,) * 3
-        row = "".join(f"{number:>13.5g}" for number in numbers)
-        click.echo(f"{name:<24}{'numbers':<13}{row}{len(values) - len(seen):>13}")
+        shown = (f"{number:.5g}" for number in numbers)
+        rows.append((name, "numbers", unit, *shown, str(len(values) - len(seen))))
+    click.echo("\n".join([aligned(rows, left=3), *texts]))
 
 
 def _kind_of_text(table: Any, name: str) -> str:

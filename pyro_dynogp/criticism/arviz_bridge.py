@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 
 from pyro_dynogp.inference.pareto import good_k
+from pyro_dynogp.support.shown import preformatted
 
 
 def _arviz() -> Any:
@@ -78,6 +79,9 @@ def _elpd_class() -> Any:
                 lines += ["", f"Draws of {self['drawn']} ({self['draws_from']})."]
                 lines += [f"Fits or draws made again: {self['refits']}.", *self["notes"]]
             return "\n".join(lines)
+
+        def _repr_html_(self) -> str:
+            return preformatted(str(self))
 
     Elpd.__qualname__ = "Elpd"  # pickle finds it by `__getattr__` below
     return Elpd

@@ -16,12 +16,14 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.prediction.prediction import Prediction
 from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.shown import shown
 
 # Enough for p-values in steps of 0.2 %; more would cost time in proportion.
 MOST_SAMPLES = 500
 
 
-@dataclass(frozen=True, eq=False)
+@shown
+@dataclass(repr=False, frozen=True, eq=False)
 class Calibration:
     """Probability integral transform (PIT) of measured outputs, beside what is to be expected.
 

@@ -21,6 +21,7 @@ from pyro_dynogp.inference.pareto import good_k, psis
 from pyro_dynogp.inference.posterior_draws import PosteriorDraws
 from pyro_dynogp.inference.stability import warnings_of
 from pyro_dynogp.prediction.predict import predict
+from pyro_dynogp.support.shown import shown
 
 if TYPE_CHECKING:
     from pyro_dynogp.inference.fitted import Fitted
@@ -31,7 +32,8 @@ R_HAT, EFFECTIVE = 1.01, 400
 SAME = 2.0
 
 
-@dataclass(frozen=True)
+@shown
+@dataclass(repr=False, frozen=True)
 class Check:
     """What `check` found.
 

@@ -17,6 +17,7 @@ from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.prediction import predict as predicting
 from pyro_dynogp.prediction.prediction import Parts, Prediction
 from pyro_dynogp.support.errors import POSITIVE_OR_ZERO, invalid, one_of
+from pyro_dynogp.support.shown import shown
 
 if TYPE_CHECKING:
     from pyro_dynogp.inference.fitted import Fitted
@@ -26,7 +27,8 @@ if TYPE_CHECKING:
 SMALL, CLEAR = 4.0, 2.0
 
 
-@dataclass(frozen=True, eq=False)
+@shown
+@dataclass(repr=False, frozen=True, eq=False)
 class Comparison:
     """Models compared on one target.
 
@@ -176,7 +178,8 @@ def _autocorrelation_time(d: np.ndarray) -> float:
     return float(max(2.0 * pairs[:last].sum() - 1.0, 1.0))
 
 
-@dataclass(frozen=True, eq=False)
+@shown
+@dataclass(repr=False, frozen=True, eq=False)
 class Stack:
     """Several fits that predict together, each with its weight.
 

@@ -6,8 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pyro_dynogp.support.shown import shown
 
-@dataclass(frozen=True, eq=False)
+
+@shown
+@dataclass(repr=False, frozen=True, eq=False)
 class Envelope:
     """Simultaneous band of a curve, and how far the observed curve departs.
 

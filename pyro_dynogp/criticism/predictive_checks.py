@@ -15,11 +15,13 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.prediction.prediction import Prediction
 from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.shown import shown
 
 FALSE_ALARM = 0.05
 
 
-@dataclass(frozen=True, eq=False)
+@shown
+@dataclass(repr=False, frozen=True, eq=False)
 class PredictiveChecks:
     """J statistics of measured outputs beside those of S' joint samples of the prediction.
 

@@ -8,13 +8,15 @@ import numpy as np
 from scipy.special import ndtri
 
 from pyro_dynogp.criticism.envelope import envelope
+from pyro_dynogp.support.shown import shown
 
 # Multiples of 1/80: they hold the ends of the central 50 and 95 % intervals.
 LEVELS = np.arange(1, 80) / 80
 NOMINAL = np.arange(1, 20) / 20
 
 
-@dataclass(frozen=True, eq=False)
+@shown
+@dataclass(repr=False, frozen=True, eq=False)
 class PitCurves:
     """One output; the fields are those of `Calibration` without the axis of outputs."""
 

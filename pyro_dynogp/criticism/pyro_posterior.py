@@ -27,10 +27,12 @@ from pyro_dynogp.criticism.subjects import Subject, fingerprint_of, no_refit
 from pyro_dynogp.inference.posterior_draws import PosteriorDraws
 from pyro_dynogp.support.errors import invalid, verify
 from pyro_dynogp.support.parallel import seeded
+from pyro_dynogp.support.shown import shown
 from pyro_dynogp.support.version import __version__
 
 
-@dataclass(frozen=True, eq=False)
+@shown
+@dataclass(repr=False, frozen=True, eq=False)
 class PyroPosterior:
     """A Pyro model with draws of its posterior; make one by `from_pyro`.
 

@@ -11,9 +11,11 @@ import pandas as pd
 
 from pyro_dynogp.criticism.ranks import Uniformity, holm, uniformity
 from pyro_dynogp.support.frozen import FrozenMapping
+from pyro_dynogp.support.shown import shown
 
 
-@dataclass(frozen=True, eq=False)
+@shown
+@dataclass(repr=False, frozen=True, eq=False)
 class SimulationBasedCalibration:
     """Ranks of true values among posterior draws, and whether they are uniform.
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pyro_dynogp.criticism.envelope import Envelope, envelope
+from pyro_dynogp.support.shown import shown
 
 # Null replicates of all ranks of one quantity; more where many quantities share the level.
 REPLICATES = 1999
@@ -29,7 +30,8 @@ def rank_of(draws: np.ndarray, true: float, generator: np.random.Generator) -> i
     return below + int(generator.integers(int(close.sum()) + 1))
 
 
-@dataclass(frozen=True, eq=False)
+@shown
+@dataclass(repr=False, frozen=True, eq=False)
 class Uniformity:
     """What the ranks of one quantity say.
 
@@ -86,7 +88,11 @@ def uniformity(
 
 
 def holm(p_values: np.ndarray) -> np.ndarray:
-    """P-values (m,) adjusted for there being m of them (Holm 1979)."""
+    """P-values (m,) adjusted for there being m of them (Holm 1979).
+
+    The same as statsmodels' ``multipletests(method="holm")``, in four lines: users need no
+    statsmodels, whose first import takes 1 s.
+    """
     order = np.argsort(p_values)
     raised = p_values[order] * np.arange(len(p_values), 0, -1)
     out = np.empty_like(p_values)

@@ -7,8 +7,7 @@ import datetime
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
-from os import PathLike
-from typing import Any, NoReturn, Unpack
+from typing import Any, NoReturn
 
 import numpy as np
 import pandas as pd
@@ -16,7 +15,7 @@ import torch
 import xarray as xr
 from numpy.typing import NDArray
 
-from pyro_dynogp.data import clock, readers, writers
+from pyro_dynogp.data import clock, foreign, writers
 from pyro_dynogp.data.checks import (
     Array,
     Names,
@@ -26,12 +25,14 @@ from pyro_dynogp.data.checks import (
     fingerprint_of,
 )
 from pyro_dynogp.data.fields import checked
+from pyro_dynogp.data.sources import Sources
 from pyro_dynogp.data.writers import RecordTensors
 from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.shown import preformatted
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
-class Record:
+class Record(Sources):
     """One experiment: n samples of inputs and outputs on one clock, immutable.
 
     Args:
@@ -100,30 +101,6 @@ class Record:
         })  # fmt: skip
         for field, content in stored.items():
             object.__setattr__(self, field, content)
-
-    @classmethod
-    def from_frame(
-        cls, frame: pd.DataFrame, inputs: Names = (), outputs: Names = None,
-        **options: Unpack[readers.ColumnOptions],
-    ) -> Record:  # fmt: skip
-        """Record from a pandas DataFrame; options as in `readers.read_frame`."""
-        return cls(**readers.read_frame(frame, inputs, outputs, **options))
-
-    @classmethod
-    def from_csv(
-        cls, path: str | PathLike[str], inputs: Names = (), outputs: Names = None,
-        **options: Unpack[readers.TextOptions],
-    ) -> Record:  # fmt: skip
-        """Record from a text file of columns; options as in `readers.read_csv`."""
-        return cls(**readers.read_csv(path, inputs, outputs, **options))
-
-    @classmethod
-    def from_xarray(
-        cls, dataset: xr.Dataset, inputs: Names = (), outputs: Names = None,
-        **options: Unpack[readers.ColumnOptions],
-    ) -> Record:  # fmt: skip
-        """Record from an xarray Dataset; options as in `readers.read_xarray`."""
-        return cls(**readers.read_xarray(dataset, inputs, outputs, **options))
 
     def __len__(self) -> int:
         return len(self.time)
@@ -276,6 +253,17 @@ class Record:
             raise invalid("name", expected=f"an extra channel {list(self.extra)}", got=repr(name))
         return self.select(inputs=(*self.input_names, name))
 
+    def with_holidays(
+        self, country: str, subdivision: str | None = None, *, name: str = "holiday"
+    ) -> Record:
+        """The record with an extra channel: 1 on public holidays in its zone, 0 on other days.
+
+        Args: as those of `foreign.holidays_of`; it takes the package holidays.
+            name: of the channel.
+        """
+        column = foreign.holidays_of(self.timestamps, country, subdivision)
+        return dataclasses.replace(self, extra={**self.extra, name: column})
+
     def with_outputs(self, outputs: Any, names: Names = None, units: Names = None) -> Record:
         """Return the same record with other outputs (n, n_y); NaN marks missing samples.
 
@@ -325,6 +313,9 @@ class Record:
             f"inputs={list(self.input_names)}, outputs={list(self.output_names)}, "
             f"missing={int(self.missing.sum())}, extra={list(self.extra)})"
         )
+
+    def _repr_html_(self) -> str:
+        return preformatted(self.summary())
 
     def summary(self) -> str:
         """Table of the channels: role, unit, smallest, mean and largest value, gaps."""

@@ -14,12 +14,14 @@ from pyro_dynogp.data.checks import Array
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.records import as_records
 from pyro_dynogp.support.errors import invalid, verify_fields, whole
+from pyro_dynogp.support.shown import shown
 
 _ARRAYS = ("input_offset", "input_scale", "output_offset", "output_scale")
 _NAMES = ("input_names", "output_names", "input_units", "output_units")
 _ORDERS = ("input_order", "output_order")
 
 
+@shown
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Scaling:
     """Clock and signal scales of the training data, learnt from them alone.

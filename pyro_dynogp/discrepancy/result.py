@@ -12,6 +12,7 @@ import numpy as np
 
 from pyro_dynogp.statistics.evidence import Curve, Evidence
 from pyro_dynogp.support.errors import PATH
+from pyro_dynogp.support.shown import shown
 from pyro_dynogp.support.writing import write_text
 
 if TYPE_CHECKING:
@@ -31,7 +32,8 @@ RELY_ON_BEFORE = (
 )
 
 
-@dataclass(frozen=True, eq=False)
+@shown
+@dataclass(repr=False, frozen=True, eq=False)
 class Attempt:
     """One effect that was considered in one round.
 
@@ -93,7 +95,8 @@ class EffectTest:
     decision: Outcome
 
 
-@dataclass(frozen=True, eq=False)
+@shown
+@dataclass(repr=False, frozen=True, eq=False)
 class FoundEffect:
     """An effect that was added to the model, or one that is only reported (feedback).
 
@@ -122,7 +125,8 @@ class FoundEffect:
     experiment: str = ""
 
 
-@dataclass(frozen=True, eq=False)
+@shown
+@dataclass(repr=False, frozen=True, eq=False)
 class LoopResult:
     """Result of `close_loop`.
 

@@ -22,6 +22,7 @@ from typing import Any
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.examples.simulators import Simulation, Truth, simulate_lti, simulate_wiener
 from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.shown import shown
 
 _DAISY = "B. De Moor (ed.), DaISy: Database for the Identification of Systems, KU Leuven"
 _DRIVES = (
@@ -32,7 +33,8 @@ _STUDY = "dynoGP: Deep Gaussian Processes for dynamic system identification"
 _CIRCUIT_FILE = "WH_EstimationExample.csv"
 
 
-@dataclass(frozen=True, kw_only=True)
+@shown
+@dataclass(repr=False, frozen=True, kw_only=True)
 class Dataset:
     """A data set with its test protocol.
 

@@ -16,6 +16,7 @@ from pyro_dynogp.inference.posterior_draws import PosteriorDraws
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import seeded
+from pyro_dynogp.support.shown import shown
 
 MethodName = Literal["importance", "map", "svi", "nuts"]
 Guide = Callable[..., dict[str, Tensor]]
@@ -38,7 +39,8 @@ class Draws:
     kind: str
 
 
-@dataclass(frozen=True, eq=False)
+@shown
+@dataclass(repr=False, frozen=True, eq=False)
 class Mixture:
     """K multivariate normals of the unconstrained free sites, with the other sites at points.
 
@@ -195,7 +197,8 @@ class Mixture:
         return Sampled(values, self.method)
 
 
-@dataclass(frozen=True, eq=False)
+@shown
+@dataclass(repr=False, frozen=True, eq=False)
 class Sampled:
     """Draws of a posterior: of chains, by importance, or of a guide with trajectories as sites.
 

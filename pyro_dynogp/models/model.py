@@ -26,8 +26,10 @@ from pyro_dynogp.models.priors import FLAT, ModesPrior, direct_site
 from pyro_dynogp.models.structure import Structure
 from pyro_dynogp.models.system import DynamicSystem, StaticSystem, System
 from pyro_dynogp.models.wiring import INPUTS, Dynamic, Known, Static, Wire
+from pyro_dynogp.support.shown import shown
 
 
+@shown
 @dataclass(frozen=True)
 class Model(Structure):
     """Dynamic and static layers in any order, then measurement noise: a Pyro model.

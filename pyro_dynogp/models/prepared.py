@@ -13,6 +13,7 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.lti.grid import TimeGrid, time_grid
 from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.shown import shown
 from pyro_dynogp.support.tensors import as_tensor
 
 
@@ -24,7 +25,8 @@ class Surroundings(NamedTuple):
     first: int
 
 
-@dataclass(frozen=True, eq=False)
+@shown
+@dataclass(repr=False, frozen=True, eq=False)
 class PreparedRecord:
     """A checked record with the channels of a model, its time grid, and its scaled signals.
 

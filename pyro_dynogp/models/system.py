@@ -22,10 +22,12 @@ from pyro_dynogp.models.known import KnownFunction
 from pyro_dynogp.models.past_inputs import initial_mean, past_input_covariance, with_direct
 from pyro_dynogp.models.wiring import INPUTS, Wire
 from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.shown import shown
 from pyro_dynogp.support.tensors import Numbers, as_tensor, broadcast, joined
 
 
-@dataclass(frozen=True, eq=False)
+@shown
+@dataclass(repr=False, frozen=True, eq=False)
 class DynamicSystem:
     """A dynamic layer given its parameters: scaled inputs to scaled outputs, time in record units.
 
@@ -80,7 +82,8 @@ class DynamicSystem:
         return replace(self, first_state=initial_mean(self.past_inputs, standard))
 
 
-@dataclass(frozen=True, eq=False)
+@shown
+@dataclass(repr=False, frozen=True, eq=False)
 class StaticSystem:
     """A static layer given its parameters.
 
@@ -109,7 +112,8 @@ class StaticSystem:
         return self.function.path(x, self.residual, self.support)
 
 
-@dataclass(frozen=True, eq=False)
+@shown
+@dataclass(repr=False, frozen=True, eq=False)
 class PhysicalSystem:
     """A linear system with its noise in the units of the record; batch shape *b.
 
@@ -126,7 +130,8 @@ class PhysicalSystem:
     noise_sd: Tensor | None
 
 
-@dataclass(frozen=True, eq=False)
+@shown
+@dataclass(repr=False, frozen=True, eq=False)
 class System:
     """All layers given their parameters, in units of the scaled record.
 

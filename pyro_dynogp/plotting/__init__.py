@@ -12,6 +12,7 @@ Examples:
 
 from pyro_dynogp.plotting.calibration import calibration, predictive_checks
 from pyro_dynogp.plotting.diagnostics import history, residuals, starts
+from pyro_dynogp.plotting.models import compare, quantiles, static_function
 from pyro_dynogp.plotting.signals import prediction, record
 from pyro_dynogp.plotting.style import named
 from pyro_dynogp.plotting.systems import bode, impulse_response, pole_map
@@ -19,13 +20,16 @@ from pyro_dynogp.plotting.systems import bode, impulse_response, pole_map
 __all__ = [
     "bode",
     "calibration",
+    "compare",
     "history",
     "impulse_response",
     "named",
     "pole_map",
     "prediction",
     "predictive_checks",
+    "quantiles",
     "record",
     "residuals",
     "starts",
+    "static_function",
 ]

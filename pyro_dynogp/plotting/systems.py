@@ -9,9 +9,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
+from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.lti import views
 from pyro_dynogp.plotting import style
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.plotting.layers import Shown, frequency_grid, shown_layer
+from pyro_dynogp.support.errors import instance, invalid
 from pyro_dynogp.support.tensors import Numbers
 
 if TYPE_CHECKING:
@@ -20,7 +23,8 @@ if TYPE_CHECKING:
 DAMPING_LINES = (0.05, 0.1, 0.2, 0.4, 0.7)
 
 
-def impulse_response(fit: Fit, time: Numbers | None = None) -> Figure:
+@isolated
+def impulse_response(fit: Fit, time: Numbers | None = None, *, layer: str | None = None) -> Figure:
     """Response of each output to a unit impulse of each input, with credible bands.
 
     The bands hold 50 and 95 % of the posterior draws at each time by itself. The impulse that the
@@ -30,21 +34,24 @@ def impulse_response(fit: Fit, time: Numbers | None = None) -> Figure:
         fit: a fit with inputs. A "map" fit has one line and no band.
         time: times since the impulse (m,) [time unit of the record]; by default until the median
             response has died down, at most the length of the training record.
+        layer: of a cascade, the dynamic layer, whose signals are in standard deviations; None for
+            the only one.
 
     Raises:
-        ValueError: the model has no inputs; `time` is not a row of finite numbers.
+        ValueError: the layer has no inputs, or there is no such one; `time` is not a row of finite
+            numbers.
     """
-    _check_inputs(fit)
-    grid = _settling_grid(fit) if time is None else _row("time", time)
-    draws = _draws(views.impulse_response, fit, grid)
-    direct = _unbatched(fit.modes.D, fit)
+    shown = _with_inputs(fit, layer)
+    grid = _settling_grid(shown, fit) if time is None else _row("time", time)
+    draws = _draws(views.impulse_response, shown, grid)
+    direct = _unbatched(shown.draws.D, shown).reshape(-1, *draws.shape[2:])
     scaling = fit.scaling
     n_y, n_u = draws.shape[2:]
     figure, axes = style.panels(
         n_y, n_u, width=9.0 if n_u == 1 else 5.0 * n_u, height=1.0 + 3.4 * n_y, share_x=True
     )
-    for a, output in enumerate(zip(scaling.output_names, scaling.output_units, strict=True)):
-        for b, given in enumerate(zip(scaling.input_names, scaling.input_units, strict=True)):
+    for a, output in enumerate(shown.outputs):
+        for b, given in enumerate(shown.inputs):
             panel = axes[a, b]
             panel.axhline(0.0, color=style.MUTED, linewidth=0.9)
             style.draw_bands(panel, grid, draws[:, :, a, b])
@@ -53,7 +60,8 @@ def impulse_response(fit: Fit, time: Numbers | None = None) -> Figure:
             style.title(panel, f"from {given[0]} to {output[0]}")
             weight = direct[:, a, b]
             if np.any(weight):
-                spread = f" ± {weight.std():.2g}" if len(weight) > 1 else ""
+                varies = np.ptp(weight) > 1e-12 * np.abs(weight).max()
+                spread = f" ± {weight.std():.2g}" if varies else ""
                 panel.annotate(
                     f"and an impulse of weight {weight.mean():.2g}{spread} at time 0",
                     (0.985, 0.96),
@@ -66,12 +74,13 @@ def impulse_response(fit: Fit, time: Numbers | None = None) -> Figure:
             panel.set_xlim(grid[0], grid[-1])
     for panel in axes[-1]:
         style.label(panel, x=style.named("time since the impulse", scaling.time_unit))
-    style.title(figure, "Impulse response")
+    style.title(figure, f"Impulse response{shown.title}")
     style.legend(figure)
     return figure
 
 
-def bode(fit: Fit, omega: Numbers | None = None) -> Figure:
+@isolated
+def bode(fit: Fit, omega: Numbers | None = None, *, layer: str | None = None) -> Figure:
     """Magnitude and phase of the transfer function from each input to each output, with bands.
 
     The bands hold 50 and 95 % of the posterior draws at each frequency by itself. The phase is
@@ -81,21 +90,24 @@ def bode(fit: Fit, omega: Numbers | None = None) -> Figure:
         fit: a fit with inputs. A "map" fit has one line and no band.
         omega: increasing positive angular frequencies (m,) [rad/time unit]; by default from one
             period in twice the training record to a little above the Nyquist frequency, beyond
-            which the samples say nothing.
+            which the samples say nothing, closer around resonances, whose peaks it meets.
+        layer: of a cascade, the dynamic layer, whose signals are in standard deviations; None for
+            the only one.
 
     Raises:
-        ValueError: the model has no inputs; `omega` is not increasing and positive.
+        ValueError: the layer has no inputs, or there is no such one; `omega` is not increasing and
+            positive.
     """
-    _check_inputs(fit)
+    shown = _with_inputs(fit, layer)
     scaling = fit.scaling
     nyquist = np.pi / scaling.time_step
     if omega is None:
-        grid = np.geomspace(np.pi / scaling.duration, 1.6 * nyquist, 600)
+        grid = frequency_grid(shown, np.pi / scaling.duration, 1.6 * nyquist)
     else:
         grid = _row("omega", omega)
         if grid[0] <= 0 or (np.diff(grid) <= 0).any():
             raise invalid("omega", expected="increasing positive frequencies", got=f"{grid[:5]}...")
-    response = _draws(views.frequency_response, fit, grid)
+    response = _draws(views.frequency_response, shown, grid)
     n_y, n_u = response.shape[2:]
     figure, axes = style.panels(
         2 * n_y,
@@ -105,8 +117,8 @@ def bode(fit: Fit, omega: Numbers | None = None) -> Figure:
         ratios=[1.35, 1.0] * n_y,
         share_x=True,
     )
-    for a, output in enumerate(scaling.output_names):
-        for b, given in enumerate(scaling.input_names):
+    for a, output in enumerate(shown.outputs):
+        for b, given in enumerate(shown.inputs):
             magnitude, phase = axes[2 * a, b], axes[2 * a + 1, b]
             G = response[:, :, a, b]
             style.draw_bands(magnitude, grid, 20.0 * np.log10(np.abs(G)))
@@ -119,10 +131,7 @@ def bode(fit: Fit, omega: Numbers | None = None) -> Figure:
             style.label(phase, y="phase [degrees]")
             style.title(
                 magnitude,
-                "from "
-                + style.named(given, scaling.input_units[b])
-                + " to "
-                + style.named(output, scaling.output_units[a]),
+                f"from {style.named(*given)} to {style.named(*output)}",
             )
     for panel in axes.flat:
         panel.set_xscale("log")
@@ -138,12 +147,13 @@ def bode(fit: Fit, omega: Numbers | None = None) -> Figure:
     for panel in axes[-1]:
         style.label(panel, x=f"angular frequency [rad/{scaling.time_unit}]")
     figure.align_ylabels()
-    style.title(figure, "Bode diagram")
+    style.title(figure, f"Bode diagram{shown.title}")
     style.legend(figure)
     return figure
 
 
-def pole_map(fit: Fit) -> Figure:
+@isolated
+def pole_map(fit: Fit, *, layer: str | None = None) -> Figure:
     """Poles in the upper left half of the complex plane, with lines of constant damping.
 
     Each pole stands for a conjugate pair. Every posterior draw is a faint point; a cross marks
@@ -152,10 +162,15 @@ def pole_map(fit: Fit) -> Figure:
 
     Args:
         fit: any fit; a "map" fit has crosses alone.
+        layer: of a cascade, the dynamic layer; None for the only one.
+
+    Raises:
+        ValueError: there is no such layer, or several where none is named.
     """
+    instance("fit", fit, Fitted, "dgp.fit(...) makes one.")
     unit = fit.scaling.time_unit
-    draws = _unbatched(fit.modes.poles, fit).ravel()
-    best = np.asarray(fit.system_at(fit.mode).physical(fit.scaling).modes.poles)
+    shown = shown_layer(fit, layer)
+    draws, best = np.asarray(shown.draws.poles).ravel(), shown.best
     figure, axes = style.panels(1, width=7.6, height=6.2)
     panel = axes[0, 0]
     sampled = fit.method != "map"
@@ -191,11 +206,11 @@ def pole_map(fit: Fit) -> Figure:
     panel.set_xlim(-left, 0.02 * left)
     panel.set_ylim(0.0, top)
     panel.grid(False)
-    shown = f"real part [1/{unit}]"
+    across = f"real part [1/{unit}]"
     if beyond:
-        shown += f"      ({beyond} of {len(draws)} draws lie outside)"
-    style.label(panel, x=shown, y=f"imaginary part [rad/{unit}]")
-    style.title(figure, "Poles, one of each conjugate pair")
+        across += f"      ({beyond} of {len(draws)} draws lie outside)"
+    style.label(panel, x=across, y=f"imaginary part [rad/{unit}]")
+    style.title(figure, f"Poles{shown.title}, one of each conjugate pair")
     style.legend(figure)
     return figure
 
@@ -223,13 +238,16 @@ def _damping_lines(axes: Axes, left: float, top: float) -> None:
         )
 
 
-def _check_inputs(fit: Fit) -> None:
-    if not fit.model.inputs:
+def _with_inputs(fit: Fit, layer: str | None) -> Shown:
+    instance("fit", fit, Fitted, "dgp.fit(...) makes one.")
+    shown = shown_layer(fit, layer) if fit.model.inputs else None
+    if shown is None or not shown.draws.inputs:
         raise invalid(
             "fit",
             expected="a model with inputs, which has a transfer function",
             got="one without inputs",
         )
+    return shown
 
 
 def _row(argument: str, values: Numbers) -> np.ndarray:
@@ -241,28 +259,28 @@ def _row(argument: str, values: Numbers) -> np.ndarray:
     return row
 
 
-def _unbatched(values: Any, fit: Fit) -> np.ndarray:
+def _unbatched(values: Any, shown: Shown) -> np.ndarray:
     """Values with a first dimension of draws, which those of a "map" fit lack."""
     array = np.asarray(values)
-    return array[None] if fit.method == "map" else array
+    return array if shown.draws.batch_shape else array[None]
 
 
-def _draws(function: Any, fit: Fit, grid: np.ndarray) -> np.ndarray:
+def _draws(function: Any, shown: Shown, grid: np.ndarray) -> np.ndarray:
     """A response (S, m, n_y, n_u) of every draw, in blocks of the grid that bound the memory."""
-    modes = fit.modes
+    modes = shown.draws
     each = modes.batch_shape.numel() * modes.outputs * modes.pairs
     block = max(1, 2_000_000 // each)
     parts = [
-        _unbatched(function(modes, grid[i : i + block]), fit) for i in range(0, len(grid), block)
+        _unbatched(function(modes, grid[i : i + block]), shown) for i in range(0, len(grid), block)
     ]
     return np.concatenate(parts, axis=1)
 
 
-def _settling_grid(fit: Fit) -> np.ndarray:
+def _settling_grid(shown: Shown, fit: Fit) -> np.ndarray:
     """Times until every median response has fallen below 1 % of its largest value for good."""
     scaling = fit.scaling
     trial = np.concatenate([[0.0], np.geomspace(0.02 * scaling.time_step, scaling.duration, 300)])
-    size = np.median(np.abs(_draws(views.impulse_response, fit, trial)), axis=0)
+    size = np.median(np.abs(_draws(views.impulse_response, shown, trial)), axis=0)
     largest = size.max(axis=0)
     audible = (size > 0.01 * np.where(largest > 0, largest, 1.0)).any(axis=(1, 2))
     last = int(np.flatnonzero(audible)[-1]) if audible.any() else len(trial) - 1

@@ -16,13 +16,15 @@ from pyro_dynogp.models.system import DynamicSystem
 from pyro_dynogp.prediction.first_state import beginning
 from pyro_dynogp.prediction.records import prepared
 from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.shown import shown
 from pyro_dynogp.support.tensors import as_tensor
 
 if TYPE_CHECKING:
     from pyro_dynogp.inference.fitted import Fitted
 
 
-@dataclass(frozen=True)
+@shown
+@dataclass(repr=False, frozen=True)
 class LayerTrajectory:
     """Posterior of a layer's output along a record.
 
@@ -60,7 +62,8 @@ def trajectories(fit: Fitted, along: PreparedRecord) -> dict[str, LayerTrajector
     return found
 
 
-@dataclass(frozen=True)
+@shown
+@dataclass(repr=False, frozen=True)
 class StaticBand:
     """A static layer's function over the range of its input.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.special import log_ndtr, logsumexp, ndtr, ndtri, ndtri_exp
 
@@ -17,7 +19,7 @@ from pyro_dynogp.data.checks import as_channels, real_numbers
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.records import one_record
 from pyro_dynogp.inference.isolation import alone
-from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.errors import SWITCH, invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 
 # A quantile is found to this share of the smallest standard deviation of a component; steps for it.
@@ -272,6 +274,47 @@ class Prediction:
             columns[f"{name} 2.5 %"] = low[:, a]
             columns[f"{name} 97.5 %"] = high[:, a]
         return pd.DataFrame(columns, index=pd.Index(self.time, name="time"))
+
+    def to_xarray(self, *, samples: bool = False) -> xr.Dataset:
+        """The prediction as a Dataset over "time" and "output".
+
+        Variables `mean`, `sd` and `signal_sd` (time, output), `quantile` (probability, time,
+        output) at 2.5, 25, 50, 75 and 97.5 %, `part` (cause, time, output) of the variance by
+        cause, and with `samples` the joint samples `sample` (sample, time, output). Units of the
+        outputs are in the labels ``output_unit``.
+
+        Args:
+            samples: whether to draw and add the joint samples.
+        """
+        SWITCH.check("samples", samples)
+        levels = [0.025, 0.25, 0.5, 0.75, 0.975]
+        units = self.output_units or ("",) * len(self.output_names)
+        per = ("time", "output")
+        variables: dict[str, Any] = {
+            "mean": (per, self.mean), "sd": (per, self.sd), "signal_sd": (per, self.signal_sd),
+            "quantile": (("probability", *per), self.quantile(levels)),
+            "part": (("cause", *per), np.stack([self.parts[cause] for cause in self.parts])),
+        }  # fmt: skip
+        if samples:
+            variables["sample"] = (("sample", *per), self.samples)
+        coords = {
+            "time": self.time, "output": list(self.output_names), "probability": levels,
+            "cause": list(self.parts), "output_unit": ("output", list(units)),
+        }  # fmt: skip
+        return xr.Dataset(variables, coords, {"kind": self.kind})
+
+    def __repr__(self) -> str:
+        return (
+            f"Prediction({self.kind!r}, n={len(self)}, outputs={list(self.output_names)}, "
+            f"components={len(self.component_mean)})"
+        )
+
+    def _repr_html_(self) -> str:
+        frame = self.to_frame()
+        shown = frame if len(frame) <= 10 else pd.concat([frame[:5], frame[-5:]])
+        title = f"{self.kind}, {len(frame)} times"
+        title += "" if len(frame) <= 10 else ": the first and last five"
+        return f"<p>{html.escape(title)}</p>{shown.to_html(border=0)}"
 
     def __len__(self) -> int:
         return len(self.time)

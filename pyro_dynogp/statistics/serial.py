@@ -37,6 +37,9 @@ def autocorrelation(x: np.ndarray, lags: int) -> tuple[np.ndarray, np.ndarray]:
     """Of series (R, n) with the same missing samples: (R, lags) for lags 1, 2, ..., and pairs.
 
     The mean is removed; pairs (lags,) is the number of pairs that both are there.
+
+    statsmodels' ``acf(missing="conservative", adjusted=True)`` gives the same to 1e-15, but one
+    series at a time and without the pairs: 200 series of 5000 take it 1.9 s, 0.014 s here.
     """
     measured = np.isfinite(x[0])
     y = np.where(measured, x - np.nanmean(x, axis=1, keepdims=True), 0.0)

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 from pyro_dynogp.support.errors import COUNT, POSITIVE, invalid
+from pyro_dynogp.support.shown import shown
 
 
+@shown
 @dataclass(frozen=True)
 class LoopSettings:
     """Thresholds of `close_loop`; the defaults are those of all published counts.

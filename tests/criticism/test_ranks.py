@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy import stats
+from statsmodels.stats.multitest import multipletests
 
 from pyro_dynogp.criticism.rank_results import judged
 from pyro_dynogp.criticism.ranks import holm, rank_of, uniformity
@@ -80,6 +81,8 @@ def test_holm():
     adjusted = holm(np.array([0.04, 0.01, 0.5, 0.02]))
     np.testing.assert_allclose(adjusted, [0.08, 0.04, 0.5, 0.06])
     np.testing.assert_allclose(holm(np.array([0.9, 0.8])), [1.0, 1.0])
+    p = np.random.default_rng(0).uniform(size=40) ** 3
+    np.testing.assert_allclose(holm(p), multipletests(p, method="holm")[1], rtol=1e-12)
 
 
 def test_ties_with_the_truth_are_broken_at_random():

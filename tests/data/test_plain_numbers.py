@@ -5,6 +5,7 @@ import pytest
 
 from pyro_dynogp.data import plain_numbers, text_table
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.data.text_layout import Layout
 
 ROWS = [f"{k * 0.1!r},{float(np.sin(k))!r},{1e-300 * k!r}" for k in range(60)]
 BODY = "\n".join(ROWS) + "\n"
@@ -43,7 +44,7 @@ OTHER = {
 def read(path, least, monkeypatch):
     monkeypatch.setattr(plain_numbers, "LEAST", least)
     try:
-        table = text_table.read_table(path, None, None, None, None, "utf-8")
+        table = text_table.read_table(path)
         return {name: table.numbers(name) for name in table.columns}, len(table.lines)
     except ValueError as error:
         return str(error)
@@ -68,7 +69,7 @@ def test_plain_files_are_read_at_once_and_no_others(name, tmp_path, monkeypatch)
     path = tmp_path / "file.csv"
     path.write_bytes({**PLAIN, **OTHER}[name].encode())
     monkeypatch.setattr(plain_numbers, "LEAST", 0)
-    found = text_table._plain_table(path, None, None, None, None)
+    found = text_table._plain_table(path, Layout())
     assert (found is not None) == (name in PLAIN)
 
 
@@ -78,7 +79,7 @@ def test_options_that_do_not_fit_are_left_to_the_other_reader(options, tmp_path,
     path.write_text(PLAIN["a header"])
     monkeypatch.setattr(plain_numbers, "LEAST", 0)
     given = {"header": None, "names": None, "delimiter": None, "decimal": None, **options}
-    assert text_table._plain_table(path, **given) is None
+    assert text_table._plain_table(path, Layout(**given)) is None
 
 
 def test_small_and_compressed_files_are_read_line_by_line(tmp_path):
@@ -87,7 +88,7 @@ def test_small_and_compressed_files_are_read_line_by_line(tmp_path):
     assert plain_numbers.whole_file(path) is None
     large = tmp_path / "file.csv.gz"
     large.write_bytes(b"1" * 2**20)
-    assert text_table._plain_table(large, None, None, None, None) is None
+    assert text_table._plain_table(large, Layout()) is None
 
 
 def test_a_record_of_a_large_file(tmp_path):

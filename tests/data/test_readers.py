@@ -141,8 +141,10 @@ class TestForms:
         path = write("u,a,b,day\n1,2,3,Monday\n")
         assert list(Record.from_csv(path, ["u"], extra=["b"], sampling_time=1).extra) == ["b"]
         assert not Record.from_csv(path, ["u"], extra=None, sampling_time=1).extra
-        with refused("column 'day'", "'Monday' in line 2", "extra=[...]"):
-            Record.from_csv(path, ["u"], sampling_time=1)
+        with pytest.warns(UserWarning, match=r"'day' \(it has 'Monday' in line 2\)"):
+            assert list(Record.from_csv(path, ["u"], sampling_time=1).extra) == ["a", "b"]
+        with refused("column 'day'", "'Monday' in line 2"):
+            Record.from_csv(path, ["u"], extra=["day"], sampling_time=1)
 
     @given(
         st.lists(
@@ -201,10 +203,13 @@ class TestRefusals:
         with refused("sampling_time", "a positive number", repr(step)):
             Record.from_csv(write("u\n1\n"), ["u"], sampling_time=step)
 
-    @pytest.mark.parametrize("cell", ["x", "1_000", "1.2.3", "1,000"])
-    def test_cells_that_are_no_numbers(self, write, cell):
+    @pytest.mark.parametrize(
+        ("cell", "advice"),
+        [("x", "missing"), ("1_000", "missing"), ("1.2.3", "missing"), ("1,000", "thousands=','")],
+    )
+    def test_cells_that_are_no_numbers(self, write, cell, advice):
         path = write(f"# comment\nu;y\n1;2\n\n2;{cell}\n3.5;4\n")
-        with refused("column 'y'", repr(cell), "line 5", "missing"):
+        with refused("column 'y'", repr(cell), "line 5", advice):
             Record.from_csv(path, ["u"], output="y", sampling_time=1, decimal=".")
 
     def test_point_where_the_decimal_is_a_comma(self, write):
@@ -340,7 +345,7 @@ class TestFrames:
     )
     def test_cells_that_are_no_numbers(self, cells):
         frame = pd.DataFrame({"u": cells}, index=[7, 8])
-        with refused("column 'u'", "row ", "extra=[...]"):
+        with refused("column 'u'", "row ", "missing"):
             Record.from_frame(frame, ["u"], sampling_time=1)
 
     def test_time_column(self):

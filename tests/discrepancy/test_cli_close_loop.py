@@ -208,3 +208,38 @@ def test_a_report_that_cannot_be_written_is_written_elsewhere(folder, tmp_path, 
     assert dgp.load(model).method
     for path in (page, numbers, model):
         shutil.rmtree(path.parent)
+
+
+def test_any_named_model(folder, seen, unfitted, tmp_path):
+    for kind in ("wiener-hammerstein", "feedback"):
+        result = run(folder / "plant.csv", *COLUMNS, *QUICK, "--model", kind, "--out", tmp_path)
+        assert result.exit_code == 0, result.output
+    assert [len(model.wires) for model, _, _ in unfitted] == [3, 2]
+
+
+def test_a_saved_model(folder, seen, tmp_path):
+    """Its channels and units need not be named again; the record has the others as candidates."""
+    frame = pd.read_csv(folder / "plant.csv")
+    record = dgp.Record(
+        0.5 * np.arange(260), frame["valve"], frame["level"], input_names="valve",
+        output_names="level", input_units="V", output_units="m",
+    )  # fmt: skip
+    saved = tmp_path / "plant.safetensors"
+    quick = {"method": "map", "restarts": 1, "workers": 1, "progress": False}
+    fitted = dgp.fit(dgp.LinearDynamicGP(1, pairs=1), record[:130], **quick)
+    fitted.save(saved)
+    options = ["--model", saved, "--sampling-time", "0.5", "--quiet", "--out", tmp_path / "out"]
+    result = run(folder / "plant.csv", *options)
+    assert result.exit_code == 0, result.output
+    assert seen["fit"].training == fitted.training
+    assert seen["record"][:130].fingerprint == fitted.training[0]
+    assert list(seen["record"].extra) == ["ambient", "feed"]
+    assert "parameters at the mode" in result.stderr
+    for extra, part in (
+        (["--pairs", "2"], "--pairs"),
+        (["--input", "feed"], "--input: the saved fit has the inputs ['valve']"),
+        (["--model", "nonsense"], "neither a file nor one of linear"),
+    ):
+        result = run(folder / "plant.csv", *options, *extra)
+        assert result.exit_code == 2
+        assert part in result.stderr

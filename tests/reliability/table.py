@@ -8,12 +8,15 @@ from __future__ import annotations
 import dataclasses
 import functools
 import tempfile
+import types
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import gpytorch
 import numpy as np
+import pandas as pd
+import scipy.io
 import torch
 
 import pyro_dynogp as dgp
@@ -29,16 +32,6 @@ class World:
     def record(self):
         units = {"input_units": "V", "output_units": "m", "input_names": "valve"}
         return wiener_record(n=60, **units)
-
-    @functools.cached_property
-    def frame(self):
-        return self.record.to_frame()
-
-    @functools.cached_property
-    def table(self):
-        path = tempfile.mkdtemp() + "/table.csv"
-        self.frame.to_csv(path)
-        return path
 
     @functools.cached_property
     def blank(self):
@@ -78,6 +71,26 @@ class World:
     @functools.cached_property
     def modes(self):
         return dgp.Modes([-0.5 + 2.0j], [[0.5 + 0.15j]], [1.0], [[0.03]])
+
+    @functools.cached_property
+    def stamped(self):
+        return dgp.Record(pd.date_range("2024-01-01", periods=9, tz="UTC"), outputs=np.zeros(9))
+
+    @functools.cached_property
+    def frame(self):
+        return pd.DataFrame({"t": [0.0, 1.0, 2.0], "u": [1.0, 2.0, 4.0], "y": [0.5, 1.0, 2.0]})
+
+    @functools.cached_property
+    def text(self):
+        path = tempfile.mkdtemp() + "/data.csv"
+        self.frame.to_csv(path, index=False)
+        return path
+
+    @functools.cached_property
+    def matlab(self):
+        path = tempfile.mkdtemp() + "/data.mat"
+        scipy.io.savemat(path, {name: self.frame[name].to_numpy() for name in self.frame})
+        return path
 
     @functools.cached_property
     def past(self):
@@ -136,13 +149,14 @@ LAYER = {"inputs": NUMBER, "outputs": COUNT, "pairs": COUNT, "process_noise": SW
 CURVED = {**LAYER, "inducing": COUNT, "kernel": KERNEL}
 RUN = {"seed": SEED, "workers": COUNT, "progress": SWITCH}
 SAMPLES = {"samples": COUNT, "seed": SEED}
+AXIS = ("text", [1.0], [1.0, np.nan], 3.0, [[1.0, 2.0]])
+LAYERS = (3, "nonsense", "y")
 VARIATIONAL = {"draws": COUNT, "particles": COUNT, "learning_rate": POSITIVE}
 
 NAMES = (3, 1.5, True, b"valve", {"valve": 1}, ["absent"], [3], [None], object(), np.zeros(2))
 TEXT = (3, True, b"text", ["time"], {"a": 1}, object())
 UNITS = (3, True, b"V", {"V": 1}, ["a", "b", "c"], [3])
 FRAMES = (None, 3, "text", b"frame", {"valve": [1.0]}, [1.0], np.zeros(3), [], dict)
-COLUMNS = {"inputs": "valve", "outputs": ["y"]}
 READ = {
     "inputs": NAMES,
     "outputs": NAMES,
@@ -156,6 +170,7 @@ READ = {
     "output_units": UNITS,
     "extra_units": (3, True, "V", b"V", ["V"], {"absent": "V"}, {3: "V"}),
     "name": TEXT,
+    "nonsense": (1,),
 }
 
 
@@ -244,14 +259,27 @@ TABLE: dict[str, Entry] = {
         "extra": ({"a": [1.0]}, {3: [1.0, 2.0, 3.0]}, {"a": "text"}, {"y": [1.0, 2.0, 3.0]}, 3),
         "extra_units": ({"a": "m"}, 3)}, free=("name",),
         time=[0.0, 1.0, 2.0], inputs=[1.0, 2.0, 4.0], outputs=[0.0, 1.0, 2.0]),
-    "Record.from_frame": Entry(lambda w: w.record.from_frame, lambda w: {**COLUMNS,
-        "frame": w.frame}, {"frame": FRAMES, **READ}),
-    "Record.from_xarray": Entry(lambda w: w.record.from_xarray, lambda w: {**COLUMNS,
-        "dataset": w.record.to_xarray()}, {"dataset": FRAMES, **READ}),
-    "Record.from_csv": Entry(lambda w: w.record.from_csv, lambda w: {**COLUMNS, "path": w.table,
-        "time": "time"}, {"path": (None, 3, "/absent", "/proc", [1]), **READ, "header": SWITCH[:2],
-        "names": (3, 1.5, b"a", {"a": 1}, [3]), "delimiter": (3, b";", [";"]), "decimal": (3, "x"),
-        "encoding": (3, b"utf-8")}),
+    "Record.from_csv": Entry(lambda w: dgp.Record.from_csv,
+        lambda w: {"path": w.text, "inputs": "u", "outputs": "y", "time": "t"},
+        {"path": ("/absent", "/proc", 3, None), **READ, "header": (3, "a"), "names": (["a"], 3),
+         "delimiter": ("ab", "", 3), "decimal": ("'", 3, "ab"), "encoding": ("nonsense", 3),
+         "skip_rows": (-1, 1.5, True, "a", None, 50), "units_row": (3, "a"),
+         "missing": (True, object(), [None], [[1]]), "thousands": ("x", 3, "", "ab"),
+         "time_format": (3, "%Q", "%d.%m.%Y")}),
+    "Record.from_frame": Entry(lambda w: dgp.Record.from_frame,
+        lambda w: {"frame": w.frame, "inputs": "u", "outputs": "y", "time": "t"},
+        {"frame": FRAMES, **READ}),
+    "Record.from_xarray": Entry(lambda w: dgp.Record.from_xarray,
+        lambda w: {"dataset": w.frame.set_index("t").rename_axis("time").to_xarray(), "inputs": "u",
+                   "outputs": "y"}, {"dataset": FRAMES, **READ}),
+    "Record.from_mat": Entry(lambda w: dgp.Record.from_mat,
+        lambda w: {"path": w.matlab, "inputs": "u", "outputs": "y", "time": "t"},
+        {"path": ("/absent", "/proc", __file__, 3, None), **READ}),
+    "Record.from_benchmark": Entry(lambda w: dgp.Record.from_benchmark,
+        lambda w: {"data": types.SimpleNamespace(u=[1.0, 2.0], y=[1.0, 2.0]), "sampling_time": 1},
+        {"data": (None, 3, "text"), "sampling_time": (0, -1.0, np.nan, "a", True, [1.0])}),
+    "Record.with_holidays": Entry(lambda w: w.stamped.with_holidays, lambda w: {"country": "AT"},
+        {"country": (3, None), "subdivision": (3,)}, free=("name",), late=True),
     "Record.select": Entry(lambda w: w.record.select, lambda w: {},
         {"inputs": (3, 1.5, True, b"valve", {"valve": 1}, ["absent"], [3], object()),
          "outputs": (3, 1.5, True, b"y", {"y": 1}, ["absent"], [3], object())}),
@@ -317,7 +345,13 @@ TABLE: dict[str, Entry] = {
         {"path": ("/absent/fit", "/proc/fit", "/proc", 3, None)}),
     "Fit.to_arviz": Entry(lambda w: w.fit.to_arviz, lambda w: {},
         {"future": lambda w: [3, "a", w.past, *w.others], **SAMPLES, "prior_samples": NUMBER}),
-    "Fit.summary": Entry(lambda w: w.fit.summary, lambda w: {}, {}),
+    "Fit.summary": Entry(lambda w: w.fit.summary, lambda w: {"record": w.record},
+                         {"record": lambda w: [x for x in measured(w) if x is not None]}),
+    "Fit.to_control": Entry(lambda w: w.fit.to_control, lambda w: {},
+        {"kind": (*NAME, None), "step": POSITIVE, "draws": COUNT,
+         "layer": (3, "nonsense", "f")}, late=True),
+    "Prediction.to_xarray": Entry(lambda w: w.prediction.to_xarray, lambda w: {},
+                                  {"samples": SWITCH}),
     "loo": Entry(lambda w: dgp.loo, lambda w: {"fit": w.fit, "target": "forecast",
                  "progress": False, "refits": 0, "parameters": "mode"},
         {"fit": (None, 3, "text"), "record": lambda w: [3, "text", [], w.record[:50], *w.others],
@@ -402,6 +436,22 @@ TABLE: dict[str, Entry] = {
         {"system": (None, 3, "a"), "time": (None, "text", [1.0, 0.0]), "inputs": ("text",)}),
     "LTIParameters": Entry(lambda w: dgp.LTIParameters, lambda w: {"modes": w.modes},
                            {"modes": (None, 3, "a")}),
+    "plotting.bode": Entry(lambda w: plotting.bode, lambda w: {"fit": w.fit},
+        {"fit": (None, 3), "omega": (*AXIS, [0.0, 1.0]), "layer": LAYERS}),
+    "plotting.impulse_response": Entry(lambda w: plotting.impulse_response,
+        lambda w: {"fit": w.fit}, {"fit": (None, 3), "time": AXIS, "layer": LAYERS}),
+    "plotting.pole_map": Entry(lambda w: plotting.pole_map, lambda w: {"fit": w.fit},
+        {"fit": (None, 3), "layer": LAYERS}),
+    "plotting.static_function": Entry(lambda w: plotting.static_function,
+        lambda w: {"fit": w.bent, "record": w.record},
+        {"fit": (None, 3), "record": foreign, "layer": LAYERS, "channel": (*NUMBER, 1, None)}),
+    "plotting.compare": Entry(lambda w: plotting.compare,
+        lambda w: {"predictions": {"a": w.prediction}, "record": w.record},
+        {"predictions": (None, 3, {}, {"a": 3}), "record": unlike,
+         "skip": (-1, 60, 1.5, "a", None, True)}),
+    "plotting.quantiles": Entry(lambda w: plotting.quantiles,
+        lambda w: {"fit": w.fit, "record": w.record},
+        {"fit": (None, 3), "record": lambda w: [*measured(w), w.record[:9]]}),
     "datasets": plain(datasets.load, {"name": (*NAME, None), "nonsense": (1,)}, free=("options",),
                       name="gas_furnace"),
 }  # fmt: skip

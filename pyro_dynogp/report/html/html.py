@@ -1,4 +1,8 @@
-"""Pieces of a page: escaped text, numbers as people write them, tables, figures."""
+"""Pieces of a page: escaped text, numbers as people write them, tables, figures.
+
+No template engine: of the 940 lines of these modules most choose numbers and words, which jinja2
+would not shorten, and each function from values to escaped text is tested by itself.
+"""
 
 from __future__ import annotations
 
