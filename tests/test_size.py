@@ -21,7 +21,7 @@ LINES = 31_500
 # files of every kind (900 lines), commands (640 lines), tables of results (370 lines), systems for
 # python-control (150 lines) and figures of layers and several models (330 lines) came since. To
 # shrink, and to go.
-LINES_TODAY = 49_200
+LINES_TODAY = 49_250
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()
