@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import textwrap
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 README = ROOT / "README.md"
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 SLOW = "<!-- slow -->"
 
 _FENCED = re.compile(r"^([ ]*)```(\w*)[^\n]*\n(.*?)^\1```[ ]*$", re.DOTALL | re.MULTILINE)
@@ -41,8 +43,12 @@ def run(path: Path, names: dict[str, object] | None = None, *, slow: bool = Fals
 
 
 def prose(path: Path) -> list[str]:
-    """Paragraphs of a page without code, formulas, links and tags."""
-    text = _FENCED.sub("", path.read_text())
+    """Paragraphs of a page or a notebook without code, formulas, links and tags."""
+    text = path.read_text()
+    if path.suffix == ".ipynb":
+        cells = [cell for cell in json.loads(text)["cells"] if cell["cell_type"] == "markdown"]
+        text = "\n\n".join("".join(cell["source"]) for cell in cells)
+    text = _FENCED.sub("", text)
     text = re.sub(r"\$\$.*?\$\$|\$[^$\n]+\$|`[^`]*`|<!--.*?-->|<[^>]+>", " ", text, flags=re.DOTALL)
     text = re.sub(r"\]\([^)]*\)", "]", text)
     return [" ".join(part.split()) for part in re.split(r"\n\s*\n|\n(?=[|*#-])", text)]

@@ -1,4 +1,4 @@
-"""README and docs use plain words: idioms of this project alone are not in them."""
+"""README, docs and notebooks use plain words: idioms of this project alone are not in them."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ LONGEST = 40  # words of a sentence
 EVIDENCE = {"measurements.md", "architecture.md", "planted.md", "paper.md"}
 
 
-@pytest.mark.parametrize("path", pages.pages(), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", [*pages.pages(), *pages.NOTEBOOKS], ids=lambda path: path.stem)
 def test_words_are_plain(path):
     found = [
         f"{match.group(0)!r} (write: {instead}) in: {part[:120]}"
