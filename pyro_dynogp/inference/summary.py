@@ -30,7 +30,7 @@ def _posterior(fit: Fitted) -> str:
     line = f"{count} draws: {fit.posterior.kind}"
     if "independent draws" in fit.diagnostics:
         k, number = fit.diagnostics["pareto_k"], fit.diagnostics["independent draws"]
-        line += f"; Pareto k {k:.2f} of the proposal, {number:.0f} effective draws"
+        line += f"; Pareto k {k:.2f} of the proposal, whose effective size is {number:.0f}"
     if fit.diagnostics.get("r_hat", 1.0) > 1.0:
         line += f", R-hat {fit.diagnostics['r_hat']:.2f} of their log-density"
     return line
