@@ -75,7 +75,7 @@ def furnace():
 def test_the_custom_model_is_right_far_from_unit_scale(furnace):
     """The gas furnace has a mean of 52.4 % and a standard deviation of 3.4 %."""
     outputs = furnace["train"].outputs[:, 0]
-    error = np.sqrt(np.mean((furnace["volts"].mean(0) - outputs) ** 2))
+    error = np.sqrt(np.mean((np.asarray(furnace["volts"]).mean(0) - outputs) ** 2))
     assert error < 0.5 * outputs.std()
 
 

@@ -9,12 +9,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 
-from pyro_dynogp.data.checks import Array
+from pyro_dynogp.data.channel_statistics import by_smoothness, mean_and_sd, permutation
+from pyro_dynogp.data.checks import Array, real_numbers
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.records import as_records
-from pyro_dynogp.support.errors import invalid, verify_fields, whole
+from pyro_dynogp.support.errors import instance, invalid, verify_fields, whole
 from pyro_dynogp.support.shown import shown
+from pyro_dynogp.support.tensors import as_tensor
 
 _ARRAYS = ("input_offset", "input_scale", "output_offset", "output_scale")
 _NAMES = ("input_names", "output_names", "input_units", "output_units")
@@ -50,9 +53,11 @@ class Scaling:
     Examples:
         >>> record = dgp.datasets.load("gas_furnace").train[:60]
         >>> scaling = dgp.Scaling.from_records(record)
-        >>> scaled = (record.outputs - scaling.output_offset) / scaling.output_scale
-        >>> round(float(scaled.std()), 9)
+        >>> scaled = scaling.apply(record)
+        >>> round(float(scaled.outputs.std()), 9)
         1.0
+        >>> bool(np.allclose(scaling.invert(scaled.outputs), record.outputs))
+        True
     """
 
     time_step: float
@@ -78,7 +83,7 @@ class Scaling:
         outputs = len(self.output_scale)
         whole(0, max(outputs - 1, 0)).check("reference_output", self.reference_output)
         for field, count in zip(_ORDERS, (len(self.input_scale), outputs), strict=True):
-            object.__setattr__(self, field, _permutation(field, getattr(self, field), count))
+            object.__setattr__(self, field, permutation(field, getattr(self, field), count))
 
     @classmethod
     def from_records(cls, records: Record | Sequence[Record]) -> Scaling:
@@ -103,8 +108,8 @@ class Scaling:
             raise invalid(
                 "records", expected="an output to learn from", got="records without outputs"
             )
-        u_offset, u_scale = _statistics("input", [r.inputs for r in several], first.input_names)
-        y_offset, y_scale = _statistics("output", [r.outputs for r in several], first.output_names)
+        u_offset, u_scale = mean_and_sd("input", [r.inputs for r in several], first.input_names)
+        y_offset, y_scale = mean_and_sd("output", [r.outputs for r in several], first.output_names)
         # The mean step of a regular record carries less rounding than the median of differences.
         regular = len(several) == 1 and first.is_regular
         inputs = by_smoothness([(r.inputs - u_offset) / u_scale for r in several])
@@ -160,6 +165,51 @@ class Scaling:
                 advice="Convert the values of the record and state their unit: units mismatch.",
             )
 
+    def apply(self, record: Record) -> Record:
+        """The record with scaled inputs and outputs, without units; time and extra as they are.
+
+        Args:
+            record: with the channels and units of the training record; its outputs may be none.
+
+        Raises:
+            ValueError: other channels or units, see `check`.
+        """
+        instance("record", record, Record)
+        measured = record.n_outputs > 0
+        self.check(record, outputs=measured)
+        changes: dict[str, Any] = {
+            "inputs": (record.inputs - self.input_offset) / self.input_scale,
+            "input_units": [""] * record.n_inputs,
+        }
+        if measured:
+            changes["outputs"] = (record.outputs - self.output_offset) / self.output_scale
+            changes["output_units"] = [""] * record.n_outputs
+        return dataclasses.replace(record, **changes)
+
+    def invert(self, outputs: Any) -> Any:
+        """Scaled outputs in their units.
+
+        Args:
+            outputs: numpy array or tensor (*b, n, n_y), or (*b, n) where there is one output.
+
+        Raises:
+            ValueError: another number of outputs.
+        """
+        if outputs is None:
+            raise invalid("outputs", expected="scaled outputs", got="None")
+        if not isinstance(outputs, torch.Tensor):
+            outputs = real_numbers("outputs", outputs)
+        if self.output_scale.shape == (1,):
+            return outputs * float(self.output_scale[0]) + float(self.output_offset[0])
+        count = len(self.output_scale)
+        if outputs.ndim < 2 or outputs.shape[-1] != count:
+            got = f"shape {tuple(outputs.shape)}"
+            raise invalid("outputs", expected=f"shape (..., n, {count})", got=got)
+        scale, offset = self.output_scale, self.output_offset
+        if isinstance(outputs, torch.Tensor):
+            return outputs * as_tensor(scale) + as_tensor(offset)
+        return outputs * scale + offset
+
     def to_dict(self) -> dict[str, Any]:
         """Plain dict for JSON; floats as hexadecimal text, so that they come back to the bit."""
         plain: dict[str, Any] = {}
@@ -207,8 +257,6 @@ class Scaling:
         return hash((self.time_step, self.duration, self.input_names, self.output_names))
 
 
-# Largest numbers of a signal, and one over the smallest: squares of what is made of them have room.
-LARGEST = 1e100
 # Samples below which a record is short: it may show a part of what the system does.
 SHORT = 100.0
 
@@ -256,73 +304,3 @@ class TimeScale:
     def typical_rate(self) -> float:
         """Geometric mean [1/s] of the slowest and fastest rates."""
         return math.exp(0.5 * sum(self.rate_bounds))
-
-
-def by_smoothness(signals: Sequence[Array]) -> tuple[int, ...]:
-    """Places of scaled channels by how little they change from one sample to the next.
-
-    Channels that change alike, as switched signals may, go by when they are large. Both numbers are
-    rounded: in another order of channels sums round otherwise.
-
-    Args:
-        signals: (n, d) of each record, NaN where missing. What cannot be said comes last.
-    """
-    changes = np.concatenate([np.diff(x, axis=0) for x in signals])
-    pooled = np.concatenate(signals)
-    when = np.linspace(0.0, 1.0, len(pooled))[:, None]
-    return tuple(int(i) for i in np.lexsort((_rounded(when * pooled), _rounded(changes**2))))
-
-
-def _rounded(values: Array) -> Array:
-    """Mean of each column to nine digits after the point, gaps skipped; infinite without any."""
-    there = ~np.isnan(values)
-    mean = np.where(there, values, 0.0).sum(0) / np.maximum(there.sum(0), 1)
-    return np.where(there.any(0), np.round(mean, 9), np.inf)
-
-
-def _permutation(argument: str, given: Sequence[int], count: int) -> tuple[int, ...]:
-    """Places of so many channels, each once; as they are given where none is said."""
-    places = tuple(given) or tuple(range(count))
-    for place in places:
-        whole(0, max(count - 1, 0)).check(argument, place)
-    if len(set(places)) != count:
-        raise invalid(argument, expected=f"each place from 0 to {count - 1} once", got=f"{places}")
-    return places
-
-
-def _statistics(role: str, arrays: list[Array], names: tuple[str, ...]) -> tuple[Array, Array]:
-    """Mean and standard deviation of each column, gaps skipped; constants are refused."""
-    pooled = np.concatenate(arrays)
-    offset, scale = np.zeros(len(names)), np.ones(len(names))
-    for i, name in enumerate(names):
-        seen = pooled[~np.isnan(pooled[:, i]), i]
-        if not len(seen):
-            raise invalid(
-                f"{role} {name!r}", expected="samples to learn from", got="missing samples alone"
-            )
-        low, high = float(seen.min()), float(seen.max())
-        largest = max(abs(low), abs(high))
-        varies = f"numbers from {low:.9g} to {high:.9g}"
-        if low < high and not 1.0 / LARGEST < largest < LARGEST:
-            raise invalid(
-                f"{role} {name!r}",
-                expected=f"numbers of a size between {1.0 / LARGEST:g} and {LARGEST:g}, whose "
-                "squares are numbers, too",
-                got=varies,
-                advice="State the signal in another unit.",
-            )
-        offset[i], scale[i] = seen.mean(), seen.std()
-        if scale[i] <= 1e-12 * largest:
-            rounding = f"{varies}, which differ by rounding alone"
-            raise invalid(
-                f"{role} {name!r}",
-                expected="a signal that varies",
-                got=rounding if low < high else f"the constant {low:g}",
-                advice="Record it less the level that it varies around."
-                if low < high
-                else "There is nothing to identify: train on data in which it moves."
-                if role == "output"
-                else "Leave the input out (Record.select): a constant acts through the output "
-                "offset alone.",
-            )
-    return offset, scale
