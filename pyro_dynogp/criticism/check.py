@@ -54,7 +54,7 @@ class Check:
         """One sentence."""
         bad = [finding.name for finding in self.findings if finding.good is False]
         if not bad:
-            return "Nothing that was looked at speaks against this fit."
+            return "No check found anything against this fit."
         return f"Look again at: {', '.join(bad)}."
 
     def __getitem__(self, name: str) -> Finding:

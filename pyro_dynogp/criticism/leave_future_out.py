@@ -60,17 +60,17 @@ def forecast_findings(fit: Fitted, *, seed: int = 0) -> list[Finding]:
     """
     shortest = min(len(record) for record in fit.records)
     if not fit.collapsed or fit.method == "nuts":
-        text = "not looked at: the model would have to be sampled again; see calibration()"
+        text = "not checked: the model would have to be sampled again; see calibration()"
         return [Finding(NAME, np.nan, None, text)]
     if shortest < FEWEST:
-        text = f"not looked at: {FEWEST} samples or more are needed, there are {shortest}"
+        text = f"not checked: {FEWEST} samples or more are needed, there are {shortest}"
         return [Finding(NAME, np.nan, None, text)]
     stretches: list[Stretch] = []
     for cut, end in pairwise(CUTS):
         try:
             stretches += _ahead(fit, cut, end, seed)
         except ValueError as error:  # as where an input is constant before the cut
-            text = f"not looked at: the first {100 * cut:.0f} % cannot be fitted alone ({error})"
+            text = f"not checked: the first {100 * cut:.0f} % cannot be fitted alone ({error})"
             return [Finding(NAME, np.nan, None, text)]
     return [_finding(stretches, fit.model.is_linear)] if stretches else []
 

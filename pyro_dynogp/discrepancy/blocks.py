@@ -102,14 +102,14 @@ def blocks_of(
             raise invalid(
                 "record", expected=f"{settings.measured_samples} samples or more of each output "
                 f"that were measured in the part to be {name}", got=f"{measured} of {len(part)}",
-                advice="Give a record that goes on for longer.",
+                advice="Give a longer record.",
             )  # fmt: skip
     refit = refit or not _same(cleared[:cut], record[:cut])
     held_out = np.zeros(second, dtype=bool)
     held_out[cut:] = True
     sentence = (
         f"Fitted to {cut} samples, searched on the {second - cut} after them, reported on the last "
-        f"{len(record) - second}, which nothing looked at before."
+        f"{len(record) - second}, which no step has used."
     )
     return Blocks(cleared[:second], held_out, cleared[second:], refit, sentence, tuple(found))
 

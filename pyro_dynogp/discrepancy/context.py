@@ -263,7 +263,7 @@ class SearchContext:
                 named.setdefault(one.effect.name, one.q_value)
         if named:
             rates = ", ".join(f"{name} ({q:.2g})" for name, q in named.items())
-            return (f"Residual tests speak for (false discovery rate): {rates}.",), ()
+            return (f"Residual tests are evidence for (false discovery rate): {rates}.",), ()
         omnibus = [
             structure_left(one, self.settings, self.level, plain=other, seed=self.seed)
             for one, other in zip(looked.residuals, looked.whole, strict=True)

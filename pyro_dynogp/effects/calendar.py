@@ -134,7 +134,7 @@ def _best_of(
         scan,
         {"what": best.what, "zone": best.zone},
         f"{r.output_name!r} depends on the {best.what} ({best.zone}) beyond what the "
-        f"model knows: {about(r, scan.size)}, most at {labels[high]}, least at {labels[low]}.",
+        f"model explains: {about(r, scan.size)}, most at {labels[high]}, least at {labels[low]}.",
         curve,
     )
 

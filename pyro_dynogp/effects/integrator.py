@@ -57,7 +57,7 @@ class Integrator(Effect):
     once = True
     experiments: ClassVar = {
         "unmodelled dynamics": "a step of the input, left alone for several times the slowest time "
-        "constant: an integrator goes on at the same rate, a slow pole comes to rest",
+        "constant: an integrator continues at the same rate, a slow pole comes to rest",
         "drift": "the same record with an input of the opposite sign: what an integrator makes of "
         "it changes sign, a drift does not",
     }

@@ -137,7 +137,7 @@ class Compared:
         )
         return [
             f"What was added does harm on the last block ({scores}, elpd {self.gain:+.1f} +- "
-            f"{self.error:.1f} nats): what held-out data speak for need not last. Rely on the "
+            f"{self.error:.1f} nats): what held-out data support need not last. Rely on the "
             f"model before, which report.fit is; report.extended is the extended one. Look at its "
             f"residuals there, and confirm what was named on another record before you use it."
         ]

@@ -111,7 +111,7 @@ def _key(report: LoopResult) -> str:
     """The one number that most readers want."""
     before, after = report.before.get("rmse", np.nan), report.after.get("rmse", np.nan)
     unit, n = output_unit(report), len(report.sealed)
-    where = f"On the {n} samples that nothing had looked at before, the root mean square error"
+    where = f"On the {n} samples that no step had used before, the root mean square error"
     if not np.isfinite(before):
         return ""
     if not report.effects or not np.isfinite(after):

@@ -135,7 +135,7 @@ def _table(report: LoopResult) -> str:
             shown = [share(x) for x in (before, after)]
             change = change_of_share(before, after, _SHARES[name][1])
         rows.append([words, *shown, change] if added else [words, shown[0]])
-    caption = f"Forecast of the {len(report.sealed)} samples that nothing had looked at before"
+    caption = f"Forecast of the {len(report.sealed)} samples that no step had used before"
     if report.sealed.n_outputs > 1:
         caption += ", mean over the outputs"
     if not added:
