@@ -17,7 +17,7 @@ test: $(VENV)/installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup --durations=25
+	$(BIN)/python -m pytest -n $(WORKERS) --durations=25
 
 benchmark: $(VENV)/peers
 	$(BIN)/python -m tests.benchmarks

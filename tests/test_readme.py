@@ -16,8 +16,6 @@ import pyro_dynogp as dgp
 from tests import pages
 
 LINES = 120
-# One worker makes what all of these look at.
-pytestmark = pytest.mark.xdist_group("readme")
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,6 @@ from pathlib import Path
 import pytest
 
 PAGE = Path(__file__).parents[1] / "docs" / "structures.md"
-# One worker makes what all of these look at.
-pytestmark = pytest.mark.xdist_group("structures")
 
 
 @pytest.fixture(scope="module")

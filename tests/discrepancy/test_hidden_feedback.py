@@ -6,9 +6,6 @@ import pyro_dynogp as dgp
 from pyro_dynogp.effects.nonlinear_feedback import NonlinearFeedbackOfOutput
 from tests.prediction.test_feedback import rubbed
 
-# One worker makes what all of these look at.
-pytestmark = pytest.mark.xdist_group("hidden feedback")
-
 
 @pytest.fixture(scope="module")
 def report():
