@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from pyro_dynogp.criticism.told import Told
+from pyro_dynogp.criticism.exports import Exports
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference import storage
 from pyro_dynogp.inference.fitted import Fitted, known_fit
@@ -32,7 +32,7 @@ from pyro_dynogp.support.errors import instance, invalid, warn
 __all__ = ["Fit", "fit", "load"]
 
 
-class Fit(Told):
+class Fit(Exports):
     """A fitted model, and what can be done with it.
 
     The attributes are those of `Fitted`.

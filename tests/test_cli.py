@@ -12,20 +12,15 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from click.testing import CliRunner
 
 import pyro_dynogp as dgp
 from pyro_dynogp.cli import demonstration as demo
-from pyro_dynogp.cli import main
 from pyro_dynogp.cli.data import DATASETS
 from pyro_dynogp.examples import datasets
+from tests.commands import run
 
 QUICK = ["--pairs", "1", "--restarts", "1", "--steps", "15", "--workers", "1", "--quiet"]
 COLUMNS = ["--input", "valve", "--output", "level", "--sampling-time", "0.5"]
-
-
-def run(*arguments):
-    return CliRunner().invoke(main, list(map(str, arguments)), prog_name="pyro-dynogp")
 
 
 def refused(result, *parts):

@@ -8,7 +8,6 @@ import sys
 import numpy as np
 import pandas as pd
 import pytest
-from click.testing import CliRunner
 
 import pyro_dynogp as dgp
 from pyro_dynogp.cli import main
@@ -18,13 +17,10 @@ from pyro_dynogp.cli.messages import in_flags
 from pyro_dynogp.cli.models import MODELS, made
 from pyro_dynogp.cli.tables import aligned
 from pyro_dynogp.examples import datasets
+from tests.commands import run
 
 QUICK = ["--pairs", "1", "--restarts", "1", "--workers", "1", "--quiet", "--method", "map"]
 GERMAN = ["--input", "Ventil", "--output", "Temp", "--time", "Zeit"]
-
-
-def run(*arguments):
-    return CliRunner().invoke(main, list(map(str, arguments)), prog_name="pyro-dynogp")
 
 
 @pytest.fixture(scope="module")
@@ -306,7 +302,9 @@ def test_columns_of_tables_stay_apart():
     rows = [("name", "x"), ("a much longer name than any", "1.23e+12345"), ("b", "2")]
     lines = aligned(rows, left=1).splitlines()
     assert [re.split(r"\s{2,}", line) for line in lines] == [list(row) for row in rows]
-    assert len({line.rindex(row[1]) + len(row[1]) for line, row in zip(lines, rows)}) == 1  # noqa: B905
+    assert (
+        len({line.rindex(row[1]) + len(row[1]) for line, row in zip(lines, rows, strict=True)}) == 1
+    )
     name = "a quantity with a long name"
     test = dgp.Record([0.0, 1.0], outputs=[1.0, 2.0], output_names=name, output_units="kg/h")
     keys = ("rmse", "mae", "fit_percent", "crps", "coverage_95")

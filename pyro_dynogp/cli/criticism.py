@@ -8,13 +8,11 @@ from typing import Any
 import click
 
 from pyro_dynogp.cli.data import InvalidInput
-from pyro_dynogp.cli.options import WORK, seed
-
-SAVED = click.Path(exists=True, dir_okay=False, path_type=Path)
+from pyro_dynogp.cli.options import SAVED_FIT, WORK, seed
 
 
 @click.command()
-@click.argument("model", type=SAVED)
+@click.argument("model", type=SAVED_FIT)
 @click.option(
     "--twin", type=click.IntRange(min=20), metavar="N",
     help="Also fit the first N samples by Hamiltonian Monte Carlo and compare (minutes).",
@@ -44,7 +42,7 @@ def check(
 
 
 @click.command()
-@click.argument("models", nargs=-1, required=True, type=SAVED)
+@click.argument("models", nargs=-1, required=True, type=SAVED_FIT)
 @click.option(
     "--target", type=click.Choice(["missing sample", "forecast", "new record"]),
     default="forecast", show_default=True,

@@ -88,15 +88,7 @@ def training_and_test(data: str, columns: Columns, train: int | None) -> Parts:
         raise InvalidInput(
             f"--output: name one output column or more; pyro-dynogp info {path} lists the columns."
         )
-    known = _units(path, columns, (*inputs, *outputs))
-    record = _from_csv(
-        path,
-        inputs,
-        outputs,
-        columns,
-        input_units=[known.get(name, "") for name in inputs],
-        output_units=[known.get(name, "") for name in outputs],
-    )
+    record = _with_units(_from_csv(path, inputs, outputs, columns), columns["units"])
     if train is None:
         return Parts((record,))
     before, after = record.split(train)
@@ -176,18 +168,8 @@ def whole_record(
         )
     used = (*inputs, *outputs, columns["time"])
     extra, left_out = (candidates, ()) if candidates else _numeric(path, used, columns)
-    known = _units(path, columns, (*inputs, *outputs, *extra))
-    record = _from_csv(
-        path,
-        inputs,
-        outputs,
-        columns,
-        extra=extra,
-        input_units=[known.get(name, "") for name in inputs],
-        output_units=[known.get(name, "") for name in outputs],
-        extra_units={name: known.get(name, "") for name in extra},
-    )
-    return record, left_out
+    record = _from_csv(path, inputs, outputs, columns, extra=extra)
+    return _with_units(record, columns["units"]), left_out
 
 
 def _as_fitted(fitted: Fit, data: str, columns: Columns) -> Columns:
@@ -255,17 +237,26 @@ def _from_csv(
     )  # fmt: skip
 
 
-def _units(path: Path, columns: Columns, names: tuple[str, ...]) -> dict[str, str]:
-    """Units of the columns that are read: those of the file's row of units, or as stated."""
-    units = dict(table_of(path, columns).units)
-    for pair in columns["units"]:
+def _with_units(record: Record, stated: tuple[str, ...]) -> Record:
+    """A record with units as stated, NAME=UNIT, in place of those of the file's row of units."""
+    units: dict[str, str] = {}
+    for pair in stated:
         name, mark, unit = pair.partition("=")
-        if not mark or name not in names:
+        if not mark or name not in (*record.input_names, *record.output_names, *record.extra):
             raise InvalidInput(
                 f"--unit: expected NAME=UNIT with the name of a column that is read, got {pair!r}."
             )
         units[name] = unit
-    return units
+
+    def of(names: tuple[str, ...], own: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(units.get(name, unit) for name, unit in zip(names, own, strict=True))
+
+    return replace(
+        record,
+        input_units=of(record.input_names, record.input_units),
+        output_units=of(record.output_names, record.output_units),
+        extra_units={name: units.get(name, unit) for name, unit in record.extra_units.items()},
+    )
 
 
 def _refuse(data: str, options: Clock | Columns) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from pyro_dynogp.cli.data import DATASETS
-from pyro_dynogp.cli.files import check_folder
+from pyro_dynogp.cli.files import check_folder, saved_table, stamped
 
 if TYPE_CHECKING:
     from pyro_dynogp.data.record import Record
@@ -45,11 +45,7 @@ def example(name: str, out: Path | None) -> None:
 
 def _write(record: Record, path: Path) -> None:
     """Write all channels of a record over its time stamps or times, and print a command for it."""
-    frame = record.to_frame()
-    if record.timestamps is not None:
-        frame.index = record.timestamps.map(lambda stamp: stamp.isoformat()).rename("time")
-    frame.to_csv(path)
-    click.echo(f"{len(record)} rows in {path}")
+    saved_table(stamped(record.to_frame(), record), path)
     flags = ["--time time"]
     if record.timestamps is not None:
         # Offsets change with daylight saving; the zone is what they are offsets of.

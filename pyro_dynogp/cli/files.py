@@ -5,10 +5,14 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from pyro_dynogp.cli.data import InvalidInput
+
+if TYPE_CHECKING:
+    from pyro_dynogp.data.record import Record
 
 
 def check_folder(option: str, path: Path) -> None:
@@ -23,6 +27,21 @@ def check_folder(option: str, path: Path) -> None:
         raise InvalidInput(
             f"{option}: {folder} cannot be written to ({error.strerror})."
         ) from error
+
+
+def stamped(frame: Any, record: Record) -> Any:
+    """A table over the times of a record, with time stamps where it has them."""
+    if record.timestamps is not None:
+        frame.index = record.timestamps.map(lambda stamp: stamp.isoformat()).rename("time")
+    return frame
+
+
+def saved_table(frame: Any, path: Path) -> None:
+    """Write a table as CSV, see `saved`, and say where it is."""
+    from pyro_dynogp.support.writing import write_result
+
+    there = saved(lambda part: write_result(part, frame.to_csv, "The table"), path)
+    click.echo(f"{len(frame)} rows in {there}")
 
 
 def saved(write: Callable[[Path], object], path: Path) -> Path:

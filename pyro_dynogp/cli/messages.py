@@ -6,6 +6,7 @@ import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TextIO
 
 import click
 
@@ -84,7 +85,10 @@ def notes() -> Iterator[None]:
     with warnings.catch_warnings():
         before = warnings.showwarning
 
-        def show(message, category, filename, lineno, file=None, line=None):  # type: ignore
+        def show(
+            message: Warning | str, category: type[Warning], filename: str, lineno: int,
+            file: TextIO | None = None, line: str | None = None,
+        ) -> None:  # fmt: skip
             if category is not UserWarning:
                 before(message, category, filename, lineno, file, line)
                 return
@@ -93,6 +97,7 @@ def notes() -> Iterator[None]:
                 told.add(text)
                 click.echo(f"Note: {text}", err=True)
 
+        # `told` leaves out repetitions, which Python would by the line of code.
         warnings.simplefilter("always", UserWarning)
         warnings.showwarning = show
         yield

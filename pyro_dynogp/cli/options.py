@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, TypedDict
 
 import click
@@ -57,6 +58,8 @@ def options(*decorators: Any) -> Any:
     return apply
 
 
+# A file that a fit was saved to.
+SAVED_FIT = click.Path(exists=True, dir_okay=False, path_type=Path)
 # How a file is written.
 READING = options(
     click.option(

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Unpack
 
 import click
 
 from pyro_dynogp.cli.data import InvalidInput, record_for
-from pyro_dynogp.cli.files import check_folder, saved
+from pyro_dynogp.cli.files import check_folder, saved_table, stamped
 from pyro_dynogp.cli.models import loaded
-from pyro_dynogp.cli.options import CLOCK, Clock
+from pyro_dynogp.cli.options import CLOCK, SAVED_FIT, Clock
 
 if TYPE_CHECKING:
     from pyro_dynogp.data.record import Record
@@ -23,7 +23,7 @@ OUT = click.option(
 NO_PROCESS_NOISE = click.option(
     "--no-process-noise", is_flag=True, help="Predict the deterministic system."
 )
-SAVED = click.argument("model", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+SAVED = click.argument("model", type=SAVED_FIT)
 
 
 @click.command()
@@ -160,13 +160,8 @@ def _after(record: Record, count: int) -> Record:
 
 def _write(prediction: Prediction, record: Record, out: Path) -> None:
     """Write a prediction as CSV, with time stamps where the record has them."""
-    frame: Any = prediction.to_frame()
-    if record.timestamps is not None:
-        frame.index = record.timestamps.map(lambda stamp: stamp.isoformat()).rename("time")
+    frame = stamped(prediction.to_frame(), record)
     if str(out) == "-":
         click.echo(frame.to_csv(), nl=False)
     else:
-        from pyro_dynogp.support.writing import write_result
-
-        there = saved(lambda path: write_result(path, frame.to_csv, "The table"), out)
-        click.echo(f"{len(frame)} rows in {there}")
+        saved_table(frame, out)

@@ -183,7 +183,7 @@ def _chains(fit: Fitted) -> list[Finding]:
     worst = max(r_hat, key=lambda name: r_hat[name])
     fewest = min(ess, key=lambda name: ess[name])
     divergences = fit.diagnostics["divergences"]
-    share = divergences / max(1, len(next(iter(fit.draws.values()))))
+    share = divergences / max(1, fit.n_draws)
     return [
         Finding(
             "R-hat", r_hat[worst], r_hat[worst] < R_HAT,

@@ -58,12 +58,11 @@ def modes_of(fit: Fitted, draws: int | None, layer: str | None) -> tuple[list[Mo
         ValueError: no such dynamic layer, several layers and none named, a number of draws that is
             none.
     """
-    system = fit.system_at(fit.mode)
-    if draws is not None:
-        count = len(next(iter(fit.draws.values())))
-        number = min(COUNT.check("draws", draws), count)
-        index = np.linspace(0, count - 1, number).round().astype(int)
-        system = fit.system_at({name: value[index] for name, value in fit.draws.items()})
+    if draws is None:
+        count, system = 1, fit.system_at(fit.mode)
+    else:
+        some = fit.thinned(COUNT.check("draws", draws))
+        count, system = some.n_draws, some.system
     wires = [wire.name for wire, _ in system.dynamic]
     if layer is not None and layer not in wires:
         raise invalid("layer", expected=f"a dynamic layer among {wires}", got=repr(layer))
@@ -85,7 +84,6 @@ def modes_of(fit: Fitted, draws: int | None, layer: str | None) -> tuple[list[Mo
     if not modes.inputs:
         raise invalid("fit", expected="a layer with inputs", got="one without inputs")
     # At the mode parameters have no dimension of draws, or one of length one.
-    count = 1 if draws is None else number
     batch = modes.expand((count,))
     return [batch[k] for k in range(count)], names
 

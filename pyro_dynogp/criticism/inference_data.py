@@ -98,7 +98,7 @@ class _Export:
     @property
     def count(self) -> int:
         """S."""
-        return len(next(iter(self.fit.draws.values())))
+        return self.fit.n_draws
 
     @property
     def chains(self) -> int:
@@ -119,10 +119,7 @@ class _Export:
     @property
     def thinned(self) -> Fitted:
         """At most `samples` draws, spread evenly over all of them."""
-        if self.count <= self.samples:
-            return self.fit
-        index = np.linspace(0, self.count - 1, self.samples).round().astype(int)
-        return self.fit.with_draws({k: v[index] for k, v in self.fit.draws.items()})
+        return self.fit.thinned(self.samples)
 
     def posterior(self) -> xr.Dataset:
         """Every latent site, trajectories too, and what follows from them in physical units."""

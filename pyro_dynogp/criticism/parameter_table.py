@@ -47,7 +47,7 @@ def parameter_table(fit: Fitted) -> pd.DataFrame:
 
 def _rows(fit: Fitted) -> Iterator[Row]:
     scaling, model = fit.scaling, fit.model
-    count = len(next(iter(fit.draws.values())))
+    count = fit.n_draws
     several = len(model.wires) > 1
     for wire, layer in fit.system.dynamic:
         assert isinstance(wire.layer, Dynamic)

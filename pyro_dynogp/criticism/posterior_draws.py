@@ -80,7 +80,7 @@ def _own(fit: Fitted, count: int, seed: int) -> PosteriorDraws:
     if isinstance(posterior, Sampled) and not posterior.log_q_sites:
         if posterior.source is not None:
             return posterior.source
-        n = len(next(iter(fit.draws.values())))
+        n = fit.n_draws
         return PosteriorDraws(fit.draws, None, None, np.zeros(n, dtype=int), posterior.kind)
     if fit.method == "map":
         return judged(fit, normal_of(fit).draws(count, seed), "Laplace's approximation")
@@ -90,7 +90,7 @@ def _own(fit: Fitted, count: int, seed: int) -> PosteriorDraws:
 def equal_draws(fit: Fitted, *, count: int = DRAWS, seed: int = 0) -> PosteriorDraws:
     """Draws of equal weight of what the fit says its posterior is; of a mode, of its normal."""
     if fit.method == "importance":
-        zeros = np.zeros(len(next(iter(fit.draws.values()))), dtype=int)
+        zeros = np.zeros(fit.n_draws, dtype=int)
         return PosteriorDraws(fit.draws, None, None, zeros, fit.posterior.kind)
     return draws_of(fit, count=count, seed=seed, anneal=False)
 

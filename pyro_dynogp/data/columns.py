@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from numbers import Real
 from typing import Any, Literal, TypedDict
 
@@ -56,14 +57,14 @@ _TEXT = Rule("text", lambda value: value if isinstance(value, str) else None)
 _NAMES = Rule("a name, or a list of names", _named)
 # What options of the readers have to be; None is none given.
 _RULES = {
-    **dict.fromkeys(("time", "timezone", "time_unit", "name", "delimiter", "encoding"), _TEXT),
+    **dict.fromkeys(("time", "timezone", "time_unit", "name", "encoding", "time_format"), _TEXT),
     **dict.fromkeys(("output", "names", "input_units", "output_units"), _NAMES),
     "extra": Rule(
         '"all", a list of names, or None',
         lambda value: "all" if isinstance(value, str) and value == "all" else _named(value),
     ),
     "extra_units": Rule("units by name", _units),
-    "header": SWITCH,
+    **dict.fromkeys(("header", "units_row"), SWITCH),
 }
 
 
@@ -116,7 +117,7 @@ def choose(
     output, extra = options.get("output"), options.get("extra", "all")
     if outputs is not None and output is not None:
         raise invalid("output", expected="either output or outputs", got="both")
-    known = (lambda argument, key: named_column(columns, argument, key)) if named is None else named
+    known = named or partial(named_column, columns)
     sides: list[list[str]] = []
     for argument, value in (
         ("inputs", inputs),

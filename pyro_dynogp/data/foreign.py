@@ -10,7 +10,6 @@ from typing import Any, Unpack
 
 import numpy as np
 import pandas as pd
-import scipy.io
 
 from pyro_dynogp.data.checks import Names, real_numbers
 from pyro_dynogp.data.columns import (
@@ -69,6 +68,8 @@ def read_mat(
         ValueError: no file of this kind, unknown names, channels of different lengths, and as in
             `readers.read_frame`.
     """
+    import scipy.io  # for this alone: every import of the package would wait for it
+
     check_options(options, ColumnOptions)
     RULES["path"].check("path", path)
     try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Unpack
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -100,8 +100,8 @@ def read_csv(
     """
     check_options(options, TextOptions)
     RULES["path"].check("path", path)
-    stated = {k: v for k, v in options.items() if k in Layout.__annotations__}
-    table = read_table(Path(path), Layout(**stated))  # type: ignore[arg-type]
+    stated: dict[str, Any] = {k: v for k, v in options.items() if k in Layout.__annotations__}
+    table = read_table(Path(path), Layout(**stated))
     time, name = options.get("time"), options.get("name")
     source = None if time is None else table.times(time, options.get("timezone"))
     chosen, values = choose(

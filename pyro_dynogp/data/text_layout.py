@@ -12,7 +12,10 @@ from pyro_dynogp.support.errors import invalid
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """What a user states about a text file; `read_csv` says what each option means."""
+    """What a user states about a text file; `read_csv` says what each option means.
+
+    Texts, names and switches are what they have to be (`columns.check_options`, or the shell).
+    """
 
     header: bool | None = None
     names: Sequence[str] | None = None
@@ -39,18 +42,6 @@ class Layout:
         if isinstance(rows, bool) or not isinstance(rows, int) or rows < 0:
             expected = "the number of lines before the header, a whole number >= 0"
             raise invalid("skip_rows", expected=expected, got=repr(rows))
-        for name in ("header", "units_row"):
-            value = getattr(self, name)
-            if value is not None and not isinstance(value, bool):
-                expected = "True, False, or None to look for it"
-                raise invalid(name, expected=expected, got=repr(value))
-        names = self.names
-        if names is not None and (isinstance(names, str) or not isinstance(names, Sequence)):
-            raise invalid("names", expected="names of all columns", got=repr(names))
-        for name in ("encoding", "time_format"):
-            value = getattr(self, name)
-            if value is not None and not isinstance(value, str):
-                raise invalid(name, expected="text", got=repr(value))
         return numerals(self.decimal, self.thousands, self.missing)
 
     @property

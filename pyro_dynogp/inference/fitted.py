@@ -20,7 +20,7 @@ from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import with_outputs
 from pyro_dynogp.models.system import System
-from pyro_dynogp.support.errors import instance, invalid
+from pyro_dynogp.support.errors import COUNT, instance, invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 
 
@@ -94,6 +94,11 @@ class Fitted:
     def training(self) -> tuple[str, ...]:
         """Fingerprints of the training records."""
         return tuple(record.fingerprint for record in self.records)
+
+    @property
+    def n_draws(self) -> int:
+        """S, number of posterior draws."""
+        return len(next(iter(self.draws.values())))
 
     @property
     def collapsed(self) -> bool:
@@ -183,6 +188,18 @@ class Fitted:
     def with_draws(self, values: Mapping[str, Tensor]) -> Self:
         """The fit with other draws (S, *shape), for what is computed from draws alone."""
         return replace(self, posterior=self.posterior.with_values(values), draws=values)
+
+    def thinned(self, number: int) -> Self:
+        """The fit with at most so many of its draws, spread evenly over all of them.
+
+        Raises:
+            ValueError: fewer than one.
+        """
+        COUNT.check("number", number)
+        if self.n_draws <= number:
+            return self
+        index = np.linspace(0, self.n_draws - 1, number).round().astype(int)
+        return self.with_draws({name: value[index] for name, value in self.draws.items()})
 
     @isolated
     def log_joint(self, records: Record | Sequence[Record]) -> float:

@@ -236,7 +236,7 @@ def _posterior(
     mode = type(fit).of(at_optimum(problem.model, optima, run.seed, problem.records))
     if fit.method == "map":
         return mode
-    count = len(next(iter(fit.draws.values())))
+    count = fit.n_draws
     if fit.method == "importance":
         return type(fit).of(with_draws_around(problem, list(optima), run, count))
     if fit.method == "nuts":

@@ -158,7 +158,7 @@ def _check_numbers(fit: Fitted) -> None:
     """Refuse sites that are not the model's, of other shapes, or that are not numbers."""
     sites = {site.name: site.shape for site in fit.model.collapsed.all_sites(
         fit.scaling, len(fit.records))}  # fmt: skip
-    count = len(next(iter(fit.draws.values())))
+    count = fit.n_draws
     for kind, values, lead in (("draws", fit.draws, (count,)), ("mode", fit.mode, ())):
         shapes = {name: value.shape for name, value in values.items()}
         expected = {name: (*lead, *shape) for name, shape in sites.items()}

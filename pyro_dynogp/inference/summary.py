@@ -26,7 +26,7 @@ def _posterior(fit: Fitted) -> str:
     """What the draws are."""
     if fit.method == "map":
         return "parameters at the mode: bands leave out their uncertainty (the default counts it)"
-    count = len(next(iter(fit.draws.values())))
+    count = fit.n_draws
     line = f"{count} draws: {fit.posterior.kind}"
     if "independent draws" in fit.diagnostics:
         k, number = fit.diagnostics["pareto_k"], fit.diagnostics["independent draws"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -39,6 +40,23 @@ class Shown:
     outputs: Signals
 
 
+def chosen_layer(names: Sequence[str], layer: str | None, kind: str) -> str:
+    """The layer that a figure is of: the one named, or the only one.
+
+    Args:
+        names: of the layers of this kind. layer: which; None for the only one.
+        kind: "dynamic" or "static".
+
+    Raises:
+        ValueError: no such layer, or several where none is named.
+    """
+    if layer is not None and layer not in names:
+        raise invalid("layer", expected=f"a {kind} layer among {list(names)}", got=repr(layer))
+    if layer is None and len(names) != 1:
+        raise invalid("layer", expected=f"the name of one among {list(names)}", got="None")
+    return layer or names[0]
+
+
 def shown_layer(fit: Fit, layer: str | None) -> Shown:
     """The dynamic layer of that name; None for the only one.
 
@@ -46,10 +64,7 @@ def shown_layer(fit: Fit, layer: str | None) -> Shown:
         ValueError: no such layer, or several where none is named.
     """
     wires = {wire.name: wire for wire, _ in fit.system.dynamic}
-    if layer is not None and layer not in wires:
-        raise invalid("layer", expected=f"a dynamic layer among {list(wires)}", got=repr(layer))
-    if len(wires) != 1 and layer is None:
-        raise invalid("layer", expected=f"the name of one among {list(wires)}", got="None")
+    wire = wires[chosen_layer(list(wires), layer, "dynamic")]
     at_mode = fit.system_at(fit.mode)
     scaling = fit.scaling
     if fit.system.is_linear:
@@ -58,7 +73,6 @@ def shown_layer(fit: Fit, layer: str | None) -> Shown:
             tuple(zip(scaling.input_names, scaling.input_units, strict=True)),
             tuple(zip(scaling.output_names, scaling.output_units, strict=True)),
         )  # fmt: skip
-    wire = wires[layer or next(iter(wires))]
     made: Any = fit.system.layer(wire.name)
     modes = made.modes[0] if fit.method == "map" and made.modes.batch_shape else made.modes
     # Signals between layers are in standard deviations of theirs.
@@ -85,15 +99,21 @@ def frequency_grid(shown: Shown, low: float, high: float, count: int = 600) -> n
         shown: its poles at the optimum and of all draws. low, high: ends [rad/time].
         count: of the even grid on a logarithmic scale.
     """
-    poles = np.asarray(shown.draws.poles).reshape(-1)
-    size = np.abs(poles)
-    light = poles[(-poles.real < LIGHT * size) & (size > 0)]
-    # Where |G| of the pair alone is highest, in each draw.
-    found = [np.geomspace(low, high, count), np.sqrt(np.maximum(light.imag**2 - light.real**2, 0))]
-    best = shown.best[(-shown.best.real < LIGHT * np.abs(shown.best)) & (np.abs(shown.best) > 0)]
+    light = _resonant(np.asarray(shown.draws.poles).reshape(-1))
     some = light[:: max(1, len(light) // 100)]
-    for pole in [*best, *some]:
-        step = AROUND if pole in best else AROUND[::5]
-        found.append(pole.imag - pole.real * step)
-    grid = np.unique(np.concatenate(found))
+    grid = np.unique(
+        np.concatenate([
+            np.geomspace(low, high, count),
+            # Where |G| of the pair alone is highest, in each draw.
+            np.sqrt(np.maximum(light.imag**2 - light.real**2, 0)),
+            *(pole.imag - pole.real * AROUND for pole in _resonant(shown.best)),
+            *(pole.imag - pole.real * AROUND[::5] for pole in some),
+        ])
+    )  # fmt: skip
     return grid[(grid >= low) & (grid <= high)]
+
+
+def _resonant(poles: np.ndarray) -> np.ndarray:
+    """Poles of little damping."""
+    size = np.abs(poles)
+    return poles[(-poles.real < LIGHT * size) & (size > 0)]

@@ -13,6 +13,7 @@ from scipy.stats import beta
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.plotting import style
+from pyro_dynogp.plotting.layers import chosen_layer
 from pyro_dynogp.prediction.prediction import Prediction
 from pyro_dynogp.support.errors import instance, invalid
 
@@ -41,11 +42,7 @@ def static_function(
     instance("fit", fit, Fitted, "dgp.fit(...) makes one.")
     dynamic = {wire.name for wire, _ in fit.system.dynamic}
     names = [wire.name for wire in fit.model.wires if wire.name not in dynamic]
-    if layer is None and len(names) != 1:
-        raise invalid("layer", expected=f"the name of one among {names}", got="None")
-    if layer is not None and layer not in names:
-        raise invalid("layer", expected=f"a static layer among {names}", got=repr(layer))
-    name = layer or names[0]
+    name = chosen_layer(names, layer, "static")
     band = fit.static_function(name, record, channel=channel)
     wire = next(wire for wire in fit.model.wires if wire.name == name)
     outputs = band.mean.shape[1]

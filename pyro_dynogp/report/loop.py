@@ -188,7 +188,7 @@ def _final(
 
 def _method_of(given: Fit, model: Model) -> dict[str, Any]:
     """Options of `fit` with which a model gets a posterior of the kind that a fit has."""
-    count = len(next(iter(given.draws.values())))
+    count = given.n_draws
     if given.method == "nuts":
         chains = int(given.diagnostics["chains"])
         warmup = int(given.diagnostics.get("warmup", WARMUP))  # older files do not say

@@ -3,26 +3,24 @@
 import json
 import re
 import shutil
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
-from click.testing import CliRunner
 
 import pyro_dynogp as dgp
-from pyro_dynogp.cli import main
 from pyro_dynogp.discrepancy.result import KEPT
+from tests import commands
 from tests.discrepancy import reports
 
 COLUMNS = ["--input", "valve", "--output", "level", "--sampling-time", "0.5"]
 QUICK = ["--pairs", "1", "--restarts", "1", "--workers", "1", "--quiet"]
 
 
-def run(*arguments):
-    command = ["close-loop", *map(str, arguments)]
-    return CliRunner().invoke(main, command, prog_name="pyro-dynogp")
+run = partial(commands.run, "close-loop")
 
 
 @pytest.fixture(scope="module")

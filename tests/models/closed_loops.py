@@ -6,6 +6,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 import torch
 
 import pyro_dynogp as dgp
@@ -168,3 +169,16 @@ class ClosedLoop:
 
     def scaled(self, y):
         return (y - self.shift) / self.scale
+
+
+def check_gradient(potential):
+    """The gradient at the potential's point, along four directions, against differences."""
+    z = potential.pack(potential.at).numpy()
+    value, gradient = potential.value_and_gradient(z)
+    assert np.isfinite(value)
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        move = rng.standard_normal(len(z))
+        h = 1e-5 / np.linalg.norm(move)
+        ends = potential.values_and_gradients(np.stack([z + h * move, z - h * move]))[0]
+        assert (ends[0] - ends[1]) / (2.0 * h) == pytest.approx(gradient @ move, rel=1e-5)

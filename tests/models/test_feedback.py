@@ -9,7 +9,14 @@ from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.models.draws import JointState, Randomness, Switches
 from pyro_dynogp.models.feedback_draws import draw_outputs
 from pyro_dynogp.models.outputs import output_process
-from tests.models.closed_loops import ClosedLoop, make_record, spring, system_at, values_of
+from tests.models.closed_loops import (
+    ClosedLoop,
+    check_gradient,
+    make_record,
+    spring,
+    system_at,
+    values_of,
+)
 
 CASES = [(1, 1, False, {}), (1, 1, True, {}), (2, 1, False, {}), (2, 2, True, {}),
          (1, 1, False, {"hidden": 1}), (1, 2, True, {"hidden": 1, "both": False}),
@@ -170,12 +177,4 @@ def test_gradient_is_that_of_finite_differences(outputs, hidden):
     record = make_record(1, outputs, irregular=True)
     model = model.scaled_to(record)
     potential = Potential(model, (record,), values_of(model, record, seed=3, linear=False))
-    z = potential.pack(potential.at).numpy()
-    value, gradient = potential.values_and_gradients(z[None])
-    assert np.isfinite(value).all()
-    rng = np.random.default_rng(0)
-    for _ in range(4):
-        move = rng.standard_normal(len(z))
-        h = 1e-5 / np.linalg.norm(move)
-        ends = potential.values_and_gradients(np.stack([z + h * move, z - h * move]))[0]
-        assert (ends[0] - ends[1]) / (2.0 * h) == pytest.approx(gradient[0] @ move, rel=1e-5)
+    check_gradient(potential)

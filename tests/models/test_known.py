@@ -17,7 +17,7 @@ from pyro_dynogp.layers.sites import Site, sample
 from pyro_dynogp.models.known import middle_of
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.wiring import Dynamic, Known
-from tests.models.closed_loops import make_record, plain_loop, system_at
+from tests.models.closed_loops import check_gradient, make_record, plain_loop, system_at
 
 
 def looped(function, parameters, record=None, **options):
@@ -123,15 +123,7 @@ def test_gradient_is_that_of_finite_differences(where):
         )
         model = dgp.Cascade(1, layers, integrate="all").scaled_to(record)
     values = values_at(model, 1)
-    potential = Potential(model, (model.prepare(record),), values)
-    z = potential.pack(values).numpy()
-    _, gradient = potential.value_and_gradient(z)
-    rng = np.random.default_rng(0)
-    for _ in range(4):
-        move = rng.standard_normal(len(z))
-        h = 1e-5 / np.linalg.norm(move)
-        ends = potential.values_and_gradients(np.stack([z + h * move, z - h * move]))[0]
-        assert (ends[0] - ends[1]) / (2.0 * h) == pytest.approx(gradient @ move, rel=1e-5)
+    check_gradient(Potential(model, (model.prepare(record),), values))
 
 
 def test_prior_draws_are_those_of_a_plain_simulation():

@@ -14,7 +14,7 @@ from pyro_dynogp.inference.starts.plans import Plan, plans, starting_point
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.step import is_step
 from pyro_dynogp.models.variants import with_feedback
-from tests.models.closed_loops import make_record, system_at
+from tests.models.closed_loops import check_gradient, make_record, system_at
 from tests.models.test_known import values_at
 
 SEES = pytest.mark.parametrize(("sees", "hidden"), [("g", 0), ("g_hidden", 1)])
@@ -64,20 +64,13 @@ def test_gradient_is_that_of_finite_differences(sees, hidden):
     record = make_record(n=25)
     model = looped(record, sees, hidden)
     values = values_at(model, 1) | {"f_width": torch.tensor(0.5, dtype=torch.float64)}
-    potential = Potential(model, (model.prepare(record),), values)
-    z = potential.pack(values).numpy()
-    _, gradient = potential.value_and_gradient(z)
-    rng = np.random.default_rng(0)
-    for _ in range(4):
-        move = rng.standard_normal(len(z))
-        h = 1e-5 / np.linalg.norm(move)
-        ends = potential.values_and_gradients(np.stack([z + h * move, z - h * move]))[0]
-        assert (ends[0] - ends[1]) / (2.0 * h) == pytest.approx(gradient @ move, rel=1e-5)
+    check_gradient(Potential(model, (model.prepare(record),), values))
 
 
-def test_its_place_and_width_matter():
+@SEES
+def test_its_place_and_width_matter(sees, hidden):
     record = make_record()
-    model = looped(record, "g", 0)
+    model = looped(record, sees, hidden)
     values = values_at(model, 0)
     (prepared,) = model.prepare(record)
 

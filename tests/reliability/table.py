@@ -351,6 +351,7 @@ TABLE: dict[str, Entry] = {
         {"future": lambda w: [3, "a", w.past, *w.others], **SAMPLES, "prior_samples": NUMBER}),
     "Fit.summary": Entry(lambda w: w.fit.summary, lambda w: {"record": w.record},
                          {"record": lambda w: [x for x in measured(w) if x is not None]}),
+    "Fit.thinned": Entry(lambda w: w.fit.thinned, lambda w: {"number": 1}, {"number": COUNT}),
     "Fit.to_control": Entry(lambda w: w.fit.to_control, lambda w: {},
         {"kind": (*NAME, None), "step": POSITIVE, "draws": COUNT,
          "layer": (3, "nonsense", "f")}, late=True),

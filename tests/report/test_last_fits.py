@@ -30,7 +30,7 @@ def test_last_fits_have_fresh_starts_too(monkeypatch, model, fresh):
     monkeypatch.setattr(loop, "fit_model", fit)
     monkeypatch.setattr(loop, "refit", refit)
     found = SimpleNamespace(model=model, seed=3)
-    user = SimpleNamespace(model=dgp.LinearDynamicGP(1), method="map", draws={"a": [0.0]})
+    user = SimpleNamespace(model=dgp.LinearDynamicGP(1), method="map", n_draws=1)
     loop._final([found], user, "record", 1, False)
     assert given["restarts"] == fresh
     assert given["start"] is (near if model.has_feedback else found)

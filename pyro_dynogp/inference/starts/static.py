@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from pyro_dynogp.data.channel_statistics import by_smoothness
 from pyro_dynogp.inference.starts.dynamic import Values
 from pyro_dynogp.layers.functions import StaticFunction
 from pyro_dynogp.layers.kernels import KernelPrior
@@ -91,8 +92,9 @@ def smoothest_first(signals: Sequence[Tensor]) -> Tensor:
     Args:
         signals: (n, d) of each record.
     """
-    changes = torch.cat([x.diff(dim=0) for x in signals])
-    return (changes.square().mean(0) / torch.cat(list(signals)).var(0)).nan_to_num().argsort()
+    scale = torch.cat(list(signals)).std(0)
+    scale = torch.where(scale > 0, scale, 1.0)  # what is constant comes first
+    return torch.tensor(by_smoothness([(x / scale).numpy() for x in signals]))
 
 
 def _function(model: Model, one: Wire, layer: Static, values: Values) -> StaticFunction:

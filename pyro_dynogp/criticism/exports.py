@@ -12,8 +12,8 @@ from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.isolation import isolated
 
 
-class Told(Fitted):
-    """A fitted model that other libraries and people can be told of.
+class Exports(Fitted):
+    """A fitted model in the forms that other libraries and people take.
 
     The attributes are those of `Fitted`.
     """
@@ -115,13 +115,12 @@ class Told(Fitted):
         return summarise(self, record)
 
     def __repr__(self) -> str:
-        count = len(next(iter(self.draws.values())))
         layers = " -> ".join(wire.name for wire in self.model.wires)
         samples = sum(len(record) for record in self.records)
         return (
             f"Fit({layers}, inputs={list(self.scaling.input_names)}, "
-            f"outputs={list(self.scaling.output_names)}, method={self.method!r}, draws={count}, "
-            f"samples={samples}, seed={self.seed})"
+            f"outputs={list(self.scaling.output_names)}, method={self.method!r}, "
+            f"draws={self.n_draws}, samples={samples}, seed={self.seed})"
         )
 
     def _repr_html_(self) -> str:
