@@ -293,7 +293,7 @@ class Potential:
         z, _, _ = descend(
             self.with_jacobian, self.pack(values).numpy(), steps, every=every, first=0
         )
-        z, _ = polished(self.with_jacobian, z)
+        z, _, _ = polished(self.with_jacobian, z)
         return z, bounded_root(self.hessian(z))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -77,14 +77,24 @@ class PreparedRecord:
         if not first:
             return self
         time, inputs, before = self.surroundings
+        return replace(
+            self._part(slice(first, None)), around=Surroundings(time, inputs, before + first)
+        )
+
+    def head(self, count: int) -> PreparedRecord:
+        """Its first samples."""
+        return self._part(slice(0, count))
+
+    def _part(self, part: slice) -> PreparedRecord:
+        """Some samples in a row, in the same units, with what is known around the whole."""
         return PreparedRecord(
-            self.record[first:],
+            self.record[part],
             self.scaling,
-            time_grid(self.grid.time[first:]),
-            self.inputs[first:],
-            self.scaled_inputs[first:],
-            self.observations[first:],
-            Surroundings(time, inputs, before + first),
+            time_grid(self.grid.time[part]),
+            self.inputs[part],
+            self.scaled_inputs[part],
+            self.observations[part],
+            self.around,
         )
 
     @property

@@ -458,17 +458,19 @@ class TestEnds:
             by_x = 4.0 * (x - 1.0) ** 3 + 2.0 * (x - 1.0) - by_y
             return values, np.stack([by_x, by_y, 0.0 * x], 1)
 
-        z, value = polished(functions, np.array([2.5, 0.0, 7.0]))
+        z, value, ended = polished(functions, np.array([2.5, 0.0, 7.0]))
         np.testing.assert_allclose(z, [1.0, 1.0, 7.0], atol=1e-9)
         assert value < 1e-15
+        assert ended
 
     def test_a_step_that_leads_no_lower_is_shortened(self):
         def functions(z):
             x = z[:, 0]
             return np.log(np.cosh(x)) + 1e-3 * x * x, (np.tanh(x) + 2e-3 * x)[:, None]
 
-        z, _ = polished(functions, np.array([2.0]))  # a full Newton step goes far beyond
+        z, _, ended = polished(functions, np.array([2.0]))  # a full Newton step goes far beyond
         assert abs(z[0]) < 1e-8
+        assert ended
 
     def test_rounding_is_no_slope(self):
         def functions(z):

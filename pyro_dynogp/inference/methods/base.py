@@ -22,6 +22,9 @@ from pyro_dynogp.support.frozen import FrozenMapping
 
 # Samples below which a record has no time scale.
 FEWEST = 3
+# Samples from which optima are looked for along an excerpt first, how long that is, and the
+# variance that all of its signals have at least, as a share of the record's.
+LONG, EXCERPT, LIVELY = 16_000, 8_000, 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +72,23 @@ class Problem:
     def scaling(self) -> Scaling:
         """In whose units the model is fitted."""
         return self.records[0].scaling
+
+    @property
+    def excerpt(self) -> Problem | None:
+        """The same of the first part of a long record; None where the whole is needed.
+
+        So it is with several records, and where an input or output hardly moves in that part.
+        """
+        if len(self.records) > 1 or len(self.records[0]) < LONG:
+            return None
+        part = self.records[0].head(EXCERPT)
+        variances = [
+            np.nanvar(signals.numpy(), axis=0)
+            for one in (part, self.records[0])
+            for signals in (one.scaled_inputs, one.scaled_outputs)
+        ]
+        few, whole = np.concatenate(variances[:2]), np.concatenate(variances[2:])
+        return replace(self, records=(part,)) if (few >= LIVELY * whole).all() else None
 
     def fitted(
         self,

@@ -47,6 +47,8 @@ STEPS: Mapping[str, int] = MappingProxyType(
 FUNCTION_STEPS: Mapping[str, int] = MappingProxyType(
     {"gauss-newton": 40, "lbfgs": 600, "preconditioned": 600, "adam": 600}
 )
+# Optima along an excerpt of a long record from which climbs go on along the whole.
+CARRIED = 3
 # Process noise at which climbs from optima without any begin, as a share of that of a linear fit,
 # which has it explain what the functions should.
 FAINT = 0.03
@@ -154,37 +156,60 @@ def best_optima(
     Raises:
         ValueError: where no start leads to a point with a density.
     """
-    model, records, learnt = problem.model, problem.records, problem.learnt
+    model, learnt = problem.model, problem.learnt
+    excerpt = problem.excerpt if learnt is None else None
     if learnt is not None and run.restarts == 0:
         usual = optimizer_for if model.has_function else optimizer_near
         optimizer = optimizer or usual(model)
         with seeded(run.seed):  # what has no typical value is drawn
-            start = starting_point(model, records, Plan(None, None, False, run.seed))
-        optima = maximise(
-            problem.target, records, [grown(learnt, start)], run, optimizer=optimizer,
-            steps=steps or (FUNCTION_STEPS if model.has_function else STEPS)[optimizer],
-            effort=Effort(near=True),
-        )  # fmt: skip
-    elif model.is_linear:
+            start = starting_point(model, problem.records, Plan(None, None, False, run.seed))
+        starts: list[Values] = [grown(learnt, start)]
+        optima = _near(problem, starts, run, optimizer, steps, "optimum")
+    elif excerpt is not None:
         optimizer = optimizer or optimizer_for(model)
-        starts = linear_starts(model, records, run.restarts, run.seed)
-        if learnt is not None:
-            starts = [grown(learnt, starts[0]), *starts]
-        steps = steps or STEPS[optimizer]
-        optima = maximise(problem.target, records, starts, run, steps=steps, optimizer=optimizer)
-        if model.late:
-            optima = _with_others_around(problem, optima, run, optimizer, steps)
+        few = _from_all_starts(excerpt, run, optimizer, steps)[:CARRIED]
+        optima = _near(problem, [one.values for one in few], run, optimizer, steps, "whole")
     else:
-        optimizer = optimizer or optimizer_for(model)
-        optima = cascade_optima(problem, run, optimizer, steps or FUNCTION_STEPS[optimizer])
+        optima = _from_all_starts(problem, run, optimizer or optimizer_for(model), steps)
     if optima[0].energy >= WALL:
         raise ValueError(
             "fit: no start reached a point where the likelihood can be evaluated. Check the "
             "record for jumps of many orders of magnitude, or try fewer pairs."
         )
     if model.has_feedback:
-        optima = kernels_by_evidence(problem.target, records, optima, run)
+        optima = kernels_by_evidence(problem.target, problem.records, optima, run)
     return optima
+
+
+def _near(
+    problem: Problem,
+    starts: list[Values],
+    run: Run,
+    optimizer: Optimizer,
+    steps: int | None,
+    key: str,
+) -> list[Optimum]:
+    """Optima that starts near them lead to, best first."""
+    usual = FUNCTION_STEPS if problem.model.has_function else STEPS
+    return maximise(
+        problem.target, problem.records, starts, run, optimizer=optimizer,
+        steps=steps or usual[optimizer], key=key, effort=Effort(near=True),
+    )  # fmt: skip
+
+
+def _from_all_starts(
+    problem: Problem, run: Run, optimizer: Optimizer, steps: int | None
+) -> list[Optimum]:
+    """Optima from fresh starts, and from what is learnt, best first."""
+    model, records, learnt = problem.model, problem.records, problem.learnt
+    if not model.is_linear:
+        return cascade_optima(problem, run, optimizer, steps or FUNCTION_STEPS[optimizer])
+    starts = linear_starts(model, records, run.restarts, run.seed)
+    if learnt is not None:
+        starts = [grown(learnt, starts[0]), *starts]
+    steps = steps or STEPS[optimizer]
+    optima = maximise(problem.target, records, starts, run, steps=steps, optimizer=optimizer)
+    return _with_others_around(problem, optima, run, optimizer, steps) if model.late else optima
 
 
 def _with_others_around(

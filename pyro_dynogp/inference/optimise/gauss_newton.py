@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 # Change of the unconstrained vector over which a change is a derivative.
 STEP = 1e-6
 # Numbers that a filter may keep of all points that go through it together.
-KEPT = 4_000_000
+KEPT = 40_000_000
 # Dampings that are tried, as multiples of the last that was best; largest change of an entry.
 DAMPINGS = np.array([1e-4, 1e-2, 0.1, 1.0, 10.0, 1e3])
 LONGEST = 2.0

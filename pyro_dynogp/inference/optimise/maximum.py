@@ -73,9 +73,10 @@ EFFORT = Effort()
 
 @dataclass(frozen=True)
 class _Task:
-    """Starts that climb together; `goes_on` says that they have climbed already.
+    """Starts that climb together.
 
-    Sites in `held` keep their values.
+    `goes_on` says that they have climbed already, `last` that they will not climb again. Sites in
+    `held` keep their values.
     """
 
     model: Program
@@ -87,6 +88,7 @@ class _Task:
     key: str
     rate: float
     goes_on: bool
+    last: bool
     held: tuple[str, ...] = ()
 
 
@@ -146,7 +148,9 @@ def _climbs(potential: Potential, task: _Task) -> tuple[list[Climb], np.ndarray]
             return lambda functions: method(functions, z, task, every)
 
         found = in_lockstep(functions, [run(z) for z in starts])
-    if getattr(task.model, "is_linear", False):
+    # Gauss-Newton gets near the top again from near it; what else ends early does not.
+    finishes = task.last or task.optimizer != "gauss-newton"
+    if finishes and getattr(task.model, "is_linear", False):
         found = [_to_the_top(functions, one, every) for one in found]
     found = [(_placed(potential, z), history, message) for z, history, message in found]
     return found, potential.values_and_gradients(np.stack([z for z, _, _ in found]))[0]
@@ -165,7 +169,7 @@ def _to_the_top(functions: Functions, climb: Climb, every: int) -> Climb:
     if message != gauss_newton.DONE:
         z, further, _ = descend(functions, z, RIDGE, every=every, first=0)
         history = [*history, *further]
-    z, energy = polished(functions, z)
+    z, energy, _ = polished(functions, z)
     return z, [*history, energy], message
 
 
@@ -221,7 +225,9 @@ def maximise(
     # Gauss-Newton evaluates several points by itself.
     together = 1 if optimizer == "gauss-newton" else effort.together
 
-    def climb(values: Sequence[dict[str, Tensor]], count: int, label: str) -> list[Optimum]:
+    def climb(
+        values: Sequence[dict[str, Tensor]], count: int, label: str, *, last: bool = False
+    ) -> list[Optimum]:
         tasks = [
             _Task(
                 model,
@@ -233,6 +239,7 @@ def maximise(
                 f"{key}-{label}-{i}",
                 effort.rate,
                 effort.near or label.startswith("optima"),
+                last,
                 tuple(held),
             )
             for i, batch in enumerate(_batches(values, model, records, together))
@@ -252,18 +259,19 @@ def maximise(
         return sorted(optima, key=lambda optimum: round(optimum.energy - least, TIED))
 
     if len(starts) == 1:
-        return climb(starts, steps, "optimum")
+        return climb(starts, steps, "optimum", last=True)
     behind: list[Optimum] = []
     ranked: Sequence[tuple[int, float]] = ((max(1, steps // 5), effort.kept),)
     if optimizer == "gauss-newton":
         ranked = RANKED_FUNCTIONS if getattr(model, "has_function", False) else RANKED
     (first, _), *further = _stages(ranked, steps, effort.kept)
-    leading = best_first(climb(starts, first, "starts"))
+    leading = best_first(climb(starts, first, "starts", last=not further))
     for stage, (count, kept) in enumerate(further):
         cut = max(1, math.ceil(kept * len(leading) - 0.5))
         leading, behind = leading[:cut], behind + leading[cut:]
         label = "optima" if stage == 0 else f"optima-{stage}"
-        goes_on = climb([optimum.values for optimum in leading], count, label)
+        last = stage == len(further) - 1
+        goes_on = climb([optimum.values for optimum in leading], count, label, last=last)
         leading = best_first([
             replace(after, history=np.concatenate([before.history, after.history]))
             for before, after in zip(leading, goes_on, strict=True)
