@@ -58,12 +58,28 @@ def place(t, count):
 
 
 @njit(**BORROWING)
-def locate(z, low, spacing, count, weight, slope):
-    """Index of the first of four grid values for z; derivatives by z, zero beyond the ends."""
-    first, u, inside = place((z - low) / spacing, count)
+def between(table, first, u):
+    """Value at u between the second and the third of four values of a table, from `first` on."""
+    a = table[first]
+    b = table[first + 1]
+    c = table[first + 2]
+    d = table[first + 3]
+    square = a - 2.5 * b + 2.0 * c - 0.5 * d
+    cube = 1.5 * (b - c) + 0.5 * (d - a)
+    return b + u * (0.5 * (c - a) + u * (square + u * cube))
+
+
+@njit(**BORROWING)
+def locate(z, low, scale, count, weight, slope):
+    """Index of the first of four grid values for z; derivatives by z, zero beyond the ends.
+
+    scale: one over the spacing.
+    """
+    first, u, inside = place((z - low) * scale, count)
     cubic_weights(u, weight, slope)
+    inside *= scale
     for i in range(4):
-        slope[i] *= inside / spacing
+        slope[i] *= inside
     return first
 
 

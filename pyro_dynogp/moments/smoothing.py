@@ -25,16 +25,16 @@ from pyro_dynogp.moments.noise import noise_terms
 from pyro_dynogp.moments.segments import replay, restore, room
 from pyro_dynogp.moments.state import step_back, update
 from pyro_dynogp.moments.static_layer import append
-from pyro_dynogp.support.compiled import BORROWING, OPTIONS
+from pyro_dynogp.support.compiled import BORROWING, OPTIONS, WITHIN
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def _quadratic(P, h, c):
     times(P, h, c)
     return dot(h, c)
 
 
-@njit(**BORROWING)
+@njit(**WITHIN)
 def _noise_free(time, o, layout, values, centre, p, work):
     """Mean and variance of an output without its noise.
 

@@ -19,9 +19,11 @@ from numba import njit
 from pyro_dynogp.moments.functions import (
     TABLE,
     Expansion,
+    between,
     expansion,
     expansion_adjoint,
     locate,
+    place,
 )
 from pyro_dynogp.moments.layout import FLOOR
 from pyro_dynogp.support.compiled import BORROWING, INLINED, WITHIN
@@ -125,7 +127,7 @@ def _average(i, layout, values, mean, block, work):
     e = layout.outputs[i]
     f0 = layout.f_start[i]
     cross = work.cross[i]
-    z, weight4, slope4 = work.z, work.weight4, work.slope4
+    z = work.z
     for a in range(e):
         mean[a] = 0.0
         for b in range(e):
@@ -133,21 +135,17 @@ def _average(i, layout, values, mean, block, work):
         for c in range(d):
             cross[c, a] = 0.0
     grid = values.table_mean.shape[1]
+    low, scale = values.low[i], 1.0 / values.spacing[i]
     for q in range(layout.node_count[i]):
         xi = layout.nodes[i, q]
         wq = layout.node_weight[i, q]
         _node(i, q, layout, work)
         f = work.f[i, q]
         if layout.form[i] == TABLE:
-            k = locate(z[0], values.low[i], values.spacing[i], grid, weight4, slope4)
+            k, u, _ = place((z[0] - low) * scale, grid)
             for a in range(e):
-                total = 0.0
-                variance = 0.0
-                for b in range(4):
-                    total += weight4[b] * values.table_mean[f0 + a, k + b]
-                    variance += weight4[b] * values.table_variance[f0 + a, k + b]
-                f[a] = total
-                block[a, a] += wq * variance
+                f[a] = between(values.table_mean[f0 + a], k, u)
+                block[a, a] += wq * between(values.table_variance[f0 + a], k, u)
         else:
             expansion(layout.form[i], z[:d], expansion_of(i, layout, values), f[:e])
         for a in range(e):
@@ -226,6 +224,9 @@ def _average_adjoint(i, layout, values, bars, m, m_bar, P_bar, work):
     z, z_bar, w4, s4 = work.z, work.z_bar, work.weight4, work.slope4
     f_bar = work.f_bar[:e]
     grid = values.table_mean.shape[1]
+    low, scale = values.low[i], 1.0 / values.spacing[i]
+    low_bar = 0.0
+    spacing_bar = 0.0
     for q in range(layout.node_count[i]):
         xi = layout.nodes[i, q]
         wq = layout.node_weight[i, q]
@@ -240,7 +241,7 @@ def _average_adjoint(i, layout, values, bars, m, m_bar, P_bar, work):
                 total += 2.0 * P_bar[na + a, na + b] * (f[b] - m[na + b])
             f_bar[a] = wq * total
         if layout.form[i] == TABLE:
-            k = locate(z[0], values.low[i], values.spacing[i], grid, w4, s4)
+            k = locate(z[0], low, scale, grid, w4, s4)
             for a in range(e):
                 v_bar = wq * P_bar[na + a, na + a]
                 for b in range(4):
@@ -251,8 +252,8 @@ def _average_adjoint(i, layout, values, bars, m, m_bar, P_bar, work):
                         + v_bar * values.table_variance[f0 + a, k + b]
                     )
             # The grid itself may move: f depends on (z - low) / spacing.
-            bars.low[i] -= z_bar[0]
-            bars.spacing[i] -= z_bar[0] * (z[0] - values.low[i]) / values.spacing[i]
+            low_bar -= z_bar[0]
+            spacing_bar -= z_bar[0] * (z[0] - low) * scale
         else:
             part, part_bar = expansion_of(i, layout, values), expansion_of(i, layout, bars)
             expansion_adjoint(layout.form[i], z[:d], part, f_bar, z_bar[:d], part_bar)
@@ -260,6 +261,8 @@ def _average_adjoint(i, layout, values, bars, m, m_bar, P_bar, work):
             work.centre_bar[c] += z_bar[c]
             for b in range(c + 1):
                 work.root_bar[c, b] += z_bar[c] * xi[b]
+    bars.low[i] += low_bar
+    bars.spacing[i] += spacing_bar
 
 
 @njit(**WITHIN)

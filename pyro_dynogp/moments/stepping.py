@@ -9,14 +9,14 @@ import numpy as np
 from numba import njit
 
 from pyro_dynogp.lti.arithmetic import dot
-from pyro_dynogp.moments.functions import TABLE, locate
+from pyro_dynogp.moments.functions import TABLE, between, place
 from pyro_dynogp.moments.functions import expansion as expand
 from pyro_dynogp.moments.static_layer import expansion_of
 from pyro_dynogp.support.compiled import BORROWING, OPTIONS
 
 
 @njit(**BORROWING)
-def _evaluate(i, time, layout, values, a, z, weight, slope):
+def _evaluate(i, time, layout, values, a, z):
     """Write the outputs of static layer i to a = [x; f]."""
     d, e = layout.channels[i], layout.outputs[i]
     f0 = layout.f_start[i]
@@ -28,12 +28,9 @@ def _evaluate(i, time, layout, values, a, z, weight, slope):
         expand(layout.form[i], z[:d], expansion_of(i, layout, values), a[first : first + e])
         return
     count = values.table_mean.shape[1]
-    k = locate(z[0], values.low[i], values.spacing[i], count, weight, slope)
+    k, u, _ = place((z[0] - values.low[i]) * (1.0 / values.spacing[i]), count)
     for j in range(e):
-        total = 0.0
-        for b in range(4):
-            total += weight[b] * values.table_mean[f0 + j, k + b]
-        a[first + j] = total
+        a[first + j] = between(values.table_mean[f0 + j], k, u)
 
 
 @njit(**OPTIONS)
@@ -52,8 +49,6 @@ def step_through(layout, values, first, kicks, root, rows):
     a = np.zeros(A)
     x = np.empty(N)
     z = np.empty(max(1, values.slope.shape[1]))
-    weight = np.empty(4)
-    slope = np.empty(4)
     a[:N] = first
     half = N // 2
     for time in range(n):
@@ -68,7 +63,7 @@ def step_through(layout, values, first, kicks, root, rows):
                     x[j] += dot(root[k, j], kicks[time])
             a[:N] = x
         for i in range(layout.channels.shape[0]):
-            _evaluate(i, time, layout, values, a, z, weight, slope)
+            _evaluate(i, time, layout, values, a, z)
         for r in range(rows.shape[0]):
             out[time, r] = dot(rows[r], a)
     return out

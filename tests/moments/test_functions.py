@@ -17,8 +17,11 @@ def look_up(table, low, spacing, points):
     weight, slope = np.empty(4), np.empty(4)
     out = []
     for z in points:
-        k = functions.locate(z, low, spacing, len(table), weight, slope)
+        k = functions.locate(z, low, 1.0 / spacing, len(table), weight, slope)
         assert 0 <= k <= len(table) - 4
+        first, u, _ = functions.place((z - low) / spacing, len(table))
+        one_pass = functions.between(table, first, u)
+        np.testing.assert_allclose(one_pass, weight @ table[k : k + 4], rtol=1e-12, atol=1e-13)
         out.append((weight @ table[k : k + 4], slope @ table[k : k + 4]))
     return np.array(out).T
 
