@@ -52,7 +52,7 @@ def free_run_error(
             (numbers,), _ = problem.elements()
             means = filtering.run(problem.layout, numbers)[1].means
             length = SEGMENT * max(LEAST, -(-len(means) // BLOCKS))
-            for first in range(0, len(record), length):
+            for first in range(0, len(problem.layout.step), length):
                 part = slice(first, first + length)
                 step = problem.layout.step[part].copy()
                 step[0] = -1

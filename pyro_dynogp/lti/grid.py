@@ -40,6 +40,15 @@ class TimeGrid:
             return self
         return TimeGrid(self.time.to(device), self.steps.to(device), self.step_index)
 
+    def divided(self, parts: int) -> TimeGrid:
+        """Each step in equal parts: every `parts`-th time is one of this grid."""
+        if parts == 1:
+            return self
+        shares = torch.arange(parts, dtype=torch.float64, device=self.time.device) / parts
+        between = self.time[:-1, None] + shares * self.time.diff()[:, None]
+        index = np.concatenate([self.step_index[:1], np.repeat(self.step_index[1:], parts)])
+        return TimeGrid(torch.cat([between.flatten(), self.time[-1:]]), self.steps / parts, index)
+
     def rows(self, outputs: int) -> tuple[np.ndarray, np.ndarray]:
         """Step index and output index of the n * n_y rows, the outputs of one time together."""
         step = np.full((len(self), outputs), -1, dtype=np.int64)

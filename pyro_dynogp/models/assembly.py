@@ -57,15 +57,21 @@ class Assembly:
         known_state: (*b, N) real state of all dynamic layers at the last sample that known inputs
             cause, ordered as the filter's.
         blocks: static functions of the problem, in its order.
+        substeps: times of the problem from one sample to the next; outputs between are missing.
     """
 
     problem: FilterProblem
     signals: dict[str, Signal]
     known_state: Tensor
     blocks: tuple[Block, ...]
+    substeps: int = 1
 
     def with_outputs(self, y: Tensor) -> FilterProblem:
         """The problem with scaled outputs y (*b, n, n_y), NaN where missing."""
+        if self.substeps > 1:
+            wide = y.new_full((*y.shape[:-2], self.problem.y.shape[-2], y.shape[-1]), torch.nan)
+            wide[..., :: self.substeps, :] = y
+            y = wide
         return replace(self.problem, y=y)
 
 
@@ -314,10 +320,19 @@ def assemble(
     Raises:
         ValueError: where a static layer of several channels has a kernel that is not radial.
     """
+    noise_sd = system.noise_sd(inputs, grid) if noise_sd is None else noise_sd
+    parts = system.substeps
+    grid, inputs = grid.divided(parts), _held(inputs, parts)
     walk = _Assembler(system, grid, inputs)
     for place, layer in zip(system.wires, system.layers, strict=True):
         if isinstance(layer, DynamicSystem):
             walk.signals |= walk.dynamic(place, layer)
         else:
             walk.signals[place.name] = walk.static(place, layer)
-    return walk.finish(system.noise_sd(inputs, grid) if noise_sd is None else noise_sd)
+    noise_sd = noise_sd if noise_sd.shape[-2] == 1 else _held(noise_sd, parts)
+    return replace(walk.finish(noise_sd), substeps=parts)
+
+
+def _held(x: Tensor, parts: int) -> Tensor:
+    """Values (*b, n, c) of each sample for all parts of the step that follows it."""
+    return x if parts == 1 else x.repeat_interleave(parts, -2)[..., : 1 - parts, :]

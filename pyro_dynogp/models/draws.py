@@ -86,7 +86,7 @@ class Randomness:
 
     Attributes:
         state: (*shape, N). innovations: (*shape, n) or (*shape, n, w) for each dynamic layer; with
-            feedback (*shape, n, 2P), of its state.
+            feedback (*shape, k (n - 1) + 1, 2P), of its state at k parts of each step.
         residual: (*shape, e, K) for each static layer.
     """
 
@@ -104,7 +104,7 @@ class Randomness:
                 states += 2 * layer.modes.pairs
                 event = (n, layer.modes.outputs) if layer.modes.several_outputs else (n,)
                 if system.has_feedback:
-                    event = (n, 2 * layer.modes.pairs)
+                    event = (system.substeps * (n - 1) + 1, 2 * layer.modes.pairs)
                 innovations[place.name] = torch.randn(*shape, *event, dtype=torch.float64)
             else:
                 assert not isinstance(place.layer, Dynamic)

@@ -49,11 +49,11 @@ def draw_outputs(
     first = torch.zeros_like(random.state)
     if switches.initial_state:
         first = (start.root() @ random.state.unsqueeze(-1)).squeeze(-1)
-    a = _step(system, assembly, first, random, switches)
+    a = _step(system, assembly, first, random, switches)[..., :: assembly.substeps, :]
     signals: dict[str, Tensor] = {}
     before = 0
     for name, signal in assembly.signals.items():
-        value = signal.known
+        value = signal.known[..., :: assembly.substeps, :]
         if signal.rows is not None:
             value = value + a[..., before : before + value.shape[-1]]
             before += value.shape[-1]

@@ -67,7 +67,7 @@ class MomentOutputs(OutputProcess):
         elements, batch = problem.elements()
         found = each(lambda b: np.stack(compiled(problem.layout, elements[b])), len(elements))
         stacked = torch.from_numpy(np.stack(found))
-        shaped = stacked.reshape(*batch, *stacked.shape[1:])
+        shaped = stacked.reshape(*batch, *stacked.shape[1:])[..., :: self.system.substeps, :]
         return shaped[..., 0, :, :], shaped[..., 1, :, :], shaped[..., 2, :, :]
 
     def _moments(self, mean: Tensor, variance: Tensor, density: Tensor) -> Moments:
@@ -94,8 +94,9 @@ class MomentOutputs(OutputProcess):
 
     def ahead(self, y: Tensor, horizon: int) -> Moments:
         """See `OutputProcess`."""
+        steps = horizon * self.system.substeps
         return self._moments(
-            *self._pass(y, lambda layout, v: smoothing.predict_ahead(layout, v, horizon))
+            *self._pass(y, lambda layout, v: smoothing.predict_ahead(layout, v, steps))
         )
 
     def left_out(self, y: Tensor) -> Moments:
@@ -126,7 +127,7 @@ class MomentOutputs(OutputProcess):
         z = torch.cat([z, torch.full_like(z[..., :1, :], torch.nan)], -2)
         problem = assembly.with_outputs(z)
         if not process_noise:
-            problem = quiet_last_step(problem)
+            problem = quiet_last_steps(problem, self.system.substeps)
         elements, batch = problem.elements()
         N = problem.m0.shape[-1]
         ends = each(lambda b: filtering.run(problem.layout, elements[b]), len(elements))
@@ -154,14 +155,15 @@ class MomentOutputs(OutputProcess):
             return mean @ joined[b].T, variance
 
         found = each(compiled, len(elements))
-        mean = np.stack([m for m, _ in found])
-        sd = np.sqrt(np.stack([v for _, v in found]))
+        mean = np.stack([m for m, _ in found])[:, :: self.system.substeps]
+        sd = np.sqrt(np.stack([v for _, v in found]))[:, :: self.system.substeps]
         out, start = {}, 0
         for name, signal in self.assembly.signals.items():
             if name == INPUTS:
                 continue
-            n, w = signal.known.shape[-2:]
-            known = signal.known.expand(*batch, n, w).reshape(-1, n, w).numpy()
+            sampled = signal.known[..., :: self.system.substeps, :]
+            n, w = sampled.shape[-2:]
+            known = sampled.expand(*batch, n, w).reshape(-1, n, w).numpy()
             if signal.rows is None:
                 out[name] = LayerMoments(known, np.zeros_like(known))
                 continue
@@ -171,11 +173,11 @@ class MomentOutputs(OutputProcess):
         return out
 
 
-def quiet_last_step(problem: FilterProblem) -> FilterProblem:
-    """The problem with no process noise between the last two samples."""
+def quiet_last_steps(problem: FilterProblem, count: int) -> FilterProblem:
+    """The problem with no process noise in its last steps, which are equally long."""
     step = problem.layout.step.copy()
     last = int(step[-1])
-    step[-1] = problem.Q.shape[-3]  # a step of its own
+    step[-count:] = problem.Q.shape[-3]  # a step of its own
 
     def with_copy(x: Tensor, dim: int) -> Tensor:
         return torch.cat([x, x.select(dim, last).unsqueeze(dim)], dim)

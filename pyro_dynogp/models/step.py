@@ -11,6 +11,8 @@ from pyro_dynogp.support.frozen import FrozenMapping
 
 # Of the logarithm of a width in standard deviations of the signal: most from 0.02 to 1.
 WIDTH, SPREAD = -2.0, 1.0
+# Parts of a step between samples in which feedback with a step is computed anew by default.
+SUBSTEPS = 3
 
 
 def step(x: Tensor, at: Tensor, width: Tensor) -> Tensor:

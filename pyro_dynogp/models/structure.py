@@ -15,7 +15,16 @@ from pyro_dynogp.layers.noise import Gaussian, Likelihood
 from pyro_dynogp.models.arrival import free_delays
 from pyro_dynogp.models.prepared import PreparedRecord, Records
 from pyro_dynogp.models.priors import PriorName
-from pyro_dynogp.models.wiring import INPUTS, Dynamic, Known, Layer, StaticLayer, Wire, wire
+from pyro_dynogp.models.wiring import (
+    INPUTS,
+    Dynamic,
+    Known,
+    Layer,
+    StaticLayer,
+    Wire,
+    substeps_of,
+    wire,
+)
 from pyro_dynogp.support.errors import instance, invalid, one_of, verify, whole
 
 Integrate = Literal["none", "last", "all"]
@@ -79,6 +88,11 @@ class Structure:
         end = self.output_wire.layer  # placing the layers refuses those that do not fit together
         if self.has_feedback:
             _check_feedback(self.integrate, self.likelihood)
+        if self.late and self.substeps > 1:
+            raise invalid(
+                "substeps", expected="1 beside a dead time that is a parameter",
+                got=repr(self.substeps), advice="Give Delayed its dead time, or use substeps=1.",
+            )  # fmt: skip
         if self.integrate == "last" and not (
             isinstance(end, Dynamic) and self.likelihood == Gaussian() and not self.direct
         ):
@@ -120,6 +134,11 @@ class Structure:
     def has_feedback(self) -> bool:
         """Whether a static layer's output comes back to an earlier layer."""
         return any(w.feedback for w in self.wires)
+
+    @property
+    def substeps(self) -> int:
+        """Parts of a step in which what comes back is computed anew."""
+        return substeps_of(self.wires)
 
     @property
     def outputs(self) -> int:

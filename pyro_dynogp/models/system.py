@@ -20,7 +20,7 @@ from pyro_dynogp.lti.state import ModalState
 from pyro_dynogp.models.arrival import Delays
 from pyro_dynogp.models.known import KnownFunction
 from pyro_dynogp.models.past_inputs import initial_mean, past_input_covariance, with_direct
-from pyro_dynogp.models.wiring import INPUTS, Wire
+from pyro_dynogp.models.wiring import INPUTS, Wire, substeps_of
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.shown import shown
 from pyro_dynogp.support.tensors import Numbers, as_tensor, broadcast, joined
@@ -241,6 +241,11 @@ class System:
     def has_feedback(self) -> bool:
         """Whether a static layer's output comes back to an earlier layer."""
         return any(wire.feedback for wire in self.wires)
+
+    @property
+    def substeps(self) -> int:
+        """Parts of a step in which what comes back is computed anew."""
+        return substeps_of(self.wires)
 
     @property
     def is_linear(self) -> bool:

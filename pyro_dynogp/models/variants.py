@@ -9,7 +9,7 @@ from pyro_dynogp.data.channels import Channel, count_direct
 from pyro_dynogp.layers.kernels import SMOOTH
 from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.step import Step
+from pyro_dynogp.models.step import SUBSTEPS, Step
 from pyro_dynogp.models.wiring import (
     HIDDEN,
     INPUTS,
@@ -165,7 +165,10 @@ def with_feedback(model: Model, *, output: bool = True, hidden: bool = False) ->
     for wire, other in zip(model.wires, model.layers, strict=True):
         sees = () if wire.sources == (INPUTS,) and not layers else wire.sources
         if isinstance(other, Dynamic) and wire.name == seen.name:
-            other = replace(other, feedback=names, hidden=max(layer.hidden, int(hidden)))
+            parts = max(layer.substeps, SUBSTEPS if hidden else 1)
+            other = replace(
+                other, feedback=names, hidden=max(layer.hidden, int(hidden)), substeps=parts
+            )
         layers.append(replace(other, name=wire.name, sees=sees, skip=()))
         layers += back if wire.name == seen.name else []
     return replace(

@@ -15,11 +15,13 @@ from pyro_dynogp.models.layer import Limits as Limits
 from pyro_dynogp.models.layer import Static as Static
 from pyro_dynogp.models.layer import StaticLayer as StaticLayer
 from pyro_dynogp.models.layer import in_double
-from pyro_dynogp.support.errors import COUNT, RULES, instance, invalid
+from pyro_dynogp.support.errors import COUNT, RULES, instance, invalid, whole
 
 INPUTS = "inputs"
 # What follows a layer's name in that of its hidden signals.
 HIDDEN = "_hidden"
+# Most parts of a step.
+MOST_SUBSTEPS = 64
 
 
 @dataclass(frozen=True)
@@ -135,6 +137,7 @@ def wire(inputs: int, layers: Sequence[Layer], output: str | None = None) -> tup
         before = name
     _check_that_all_matter(wires, output)
     _check_hidden(wires)
+    _check_substeps(wires)
     feeds = set(back)
     for place in range(len(wires) - 1, -1, -1):
         here = wires[place]
@@ -192,6 +195,11 @@ def _check_sources(name: str, layer: Layer, width: Mapping[str, int], before: st
 
 def _letter(layer: Layer) -> str:
     return "g" if isinstance(layer, Dynamic) else "f"
+
+
+def substeps_of(wires: Sequence[Wire]) -> int:
+    """Parts of a step in which what comes back is computed anew: the most that a layer has."""
+    return max((w.layer.substeps for w in wires if isinstance(w.layer, Dynamic)), default=1)
 
 
 def _hidden(layer: Layer) -> int:
@@ -293,3 +301,16 @@ def _check_limits(name: str, layer: Static, channels: int, last: bool) -> None:
             got=f"mean {layer.mean!r}, {channels} signals, {layer.outputs} outputs"
             + ("" if last else ", not the last layer, or fed back"),
         )
+
+
+def _check_substeps(wires: Sequence[Wire]) -> None:
+    """Refuse substeps of a layer to which nothing comes back: they change nothing."""
+    for w in wires:
+        if isinstance(w.layer, Dynamic):
+            whole(1, MOST_SUBSTEPS).check(f"substeps of layer {w.name!r}", w.layer.substeps)
+            if w.layer.substeps > 1 and not w.feedback:
+                raise invalid(
+                    f"substeps of layer {w.name!r}",
+                    expected="1, or feedback to the layer",
+                    got=repr(w.layer.substeps),
+                )

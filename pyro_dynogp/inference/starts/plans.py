@@ -204,7 +204,7 @@ def _linear_state(
     if layer.outputs != model.outputs or not one.channels or other:
         return torch.zeros(len(layer.past_states), dtype=torch.float64)
     noisy = "g_noise_gain_unit" in linear
-    alone = (replace(layer, feedback=(), hidden=0, process_noise=noisy),)
+    alone = (replace(layer, feedback=(), hidden=0, substeps=1, process_noise=noisy),)
     twin = Model(
         model.inputs, alone, direct=model.direct, initial_state="integrated", scaling=record.scaling
     )
