@@ -130,8 +130,11 @@ def run(folder: Path) -> str:
             step(f"notebook {notebook.stem}", python, "notebook.py", notebook, cwd=there)
         step("install mypy", python, *pip, *pins, "mypy", cwd=there)
         (there / "typed.py").write_text(TYPED)
-        seen = step("types of the wheel", python, "-m", "mypy", "typed.py", cwd=there)
-        assert "pyro_dynogp.models.model.Model" in seen, seen
+        typed = (python, "-m", "mypy", "typed.py")
+        seen = [step("types of the wheel", *typed, cwd=there)]
+        step("editable install", python, *pip, "--no-deps", "-e", pages.ROOT, cwd=there)
+        seen.append(step("types of an editable install", *typed, cwd=there))
+        assert all("pyro_dynogp.models.model.Model" in types for types in seen), seen
         sizes = [f"{path.name}: {path.stat().st_size / 1e6:.2f} MB" for path in (sdist, wheel)]
     return table(["step", "seconds"], rows) + "\n\n" + "; ".join(sizes)
 
