@@ -140,4 +140,4 @@ def run(folder: Path) -> str:
 
 
 if __name__ == "__main__":
-    run(Path())
+    print(run(Path()).splitlines()[-1])
