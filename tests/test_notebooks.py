@@ -24,7 +24,9 @@ def test_runs_and_is_cleared(path: Path) -> None:
     client.execute(cwd=str(path.parent))
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     assert any("image/png" in output.get("data", {}) for output in outputs)
-    assert [output["text"] for output in outputs if output.get("name") == "stderr"] == []
+    errors = [output["text"] for output in outputs if output.get("name") == "stderr"]
+    # tqdm warns where there are no widgets: the extra `notebooks` has them, that of the tests not.
+    assert [text for text in errors if "TqdmWarning: IProgress not found" not in text] == []
     if path.stem == "closing_the_loop":
         finds_what_is_missing(printed(notebook))
 
