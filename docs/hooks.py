@@ -16,8 +16,11 @@ OUTSIDE = {
     "contributing.md": "CONTRIBUTING.md",
     "changes.md": "CHANGELOG.md",
 }
-# Pages whose tables need the whole width.
+# Pages whose tables need the whole width; the navigation beside the first page is empty.
 WIDE = ("comparison.md", "deep_models.md", "planted.md", "paper.md")
+HOME = "index.md"
+# What pandas writes around its tables; the theme would leave such tables too wide for a phone.
+FRAME = re.compile(r'<style scoped>.*?</style>|(?<=<table) border="1" class="dataframe"', re.DOTALL)
 TUTORIALS = ROOT / "build" / "tutorials"
 
 
@@ -41,20 +44,23 @@ def for_site(text: str) -> str:
 
 
 def on_page_markdown(markdown: str, page, **_: object) -> str:
-    """Links from pages of this folder to files outside of it; room for wide tables."""
+    """Links from pages of this folder to files outside of it; room for wide tables and code."""
     if page.file.src_uri in WIDE:
         page.meta["hide"] = ["navigation", "toc"]
+    elif page.file.src_uri == HOME:
+        page.meta["hide"] = ["navigation"]
     for name, source in OUTSIDE.items():
         markdown = re.sub(rf"\]\(((?:\.\./)*)\.\./{re.escape(source)}\)", rf"](\1{name})", markdown)
     return markdown
 
 
 def on_page_content(content: str, **_: object) -> str:
-    """Formulas as MathML, which browsers show without a script or a network."""
+    """Formulas as MathML, which browsers show without a script or a network; plain tables."""
 
     def formula(match: re.Match[str]) -> str:
         tag, text = match[1], html.unescape(match[2]).strip()
         display = "block" if tag == "div" else "inline"
         return f'<{tag} class="formula">{convert(text[2:-2], display=display)}</{tag}>'
 
+    content = FRAME.sub("", content)
     return re.sub(r'<(div|span) class="arithmatex">(.*?)</\1>', formula, content, flags=re.DOTALL)

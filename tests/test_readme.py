@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 from pathlib import Path
 
 import numpy as np
@@ -122,6 +123,21 @@ def test_vectorised_losses_have_the_same_mean(furnace):
 def test_every_public_name_in_the_readme_exists():
     for name in set(re.findall(r"\bdgp\.(\w+)", pages.README.read_text())):
         assert hasattr(dgp, name), name
+
+
+def test_a_package_index_shows_it_without_pictures_and_links_that_it_cannot_resolve():
+    pytest.importorskip("setuptools")
+    setup = runpy.run_path(str(pages.ROOT / "setup.py"))
+    text = pages.README.read_text()
+    shown = setup["description"](text)
+    assert "](https://pyro.ai)" in shown
+    assert not re.search(r"\]\((?!https?:)", shown)
+    assert "Two electric drives with a belt" in text  # the caption goes with its picture
+    assert "Two electric drives with a belt" not in shown
+    assert [line for line in shown.splitlines() if line.startswith("#")] == [
+        line for line in text.splitlines() if line.startswith("#")
+    ]
+    assert re.findall(r"```.*?```", shown, re.DOTALL) == re.findall(r"```.*?```", text, re.DOTALL)
 
 
 def test_it_is_short():

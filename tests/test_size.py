@@ -21,9 +21,10 @@ LINES = 31_500
 # order of channels (120 lines), files that are written whole (80 lines), checks of what readers
 # are given (90 lines), steps (110 lines), examples in the docstrings of all public names (350
 # lines), readers of files of every kind (900 lines), commands (640 lines), tables of results (370
-# lines), systems for python-control (150 lines) and figures of layers and several models (330
-# lines) came since. To shrink, and to go.
-LINES_TODAY = 50_100
+# lines), systems for python-control (150 lines), figures of layers and several models (330
+# lines), quoted files at once, bars of `check` (50 lines), excerpts of long records and feedback in
+# parts of a step (190 lines) came since. To shrink, and to go.
+LINES_TODAY = 50_320
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

@@ -1,12 +1,18 @@
-"""README, docs and notebooks use plain words: idioms of this project alone are not in them."""
+"""Pages, reports and messages use plain words: idioms of this project alone are not in them."""
 
 from __future__ import annotations
 
+import ast
+import html
 import re
+from pathlib import Path
 
 import pytest
 
+import pyro_dynogp as dgp
+from pyro_dynogp.report.html.page import page
 from tests import pages
+from tests.discrepancy import reports
 
 # Idiom -> what to write in its place. They are regular expressions, whatever the case.
 IDIOMS = {
@@ -44,15 +50,57 @@ LONGEST = 40  # words of a sentence
 EVIDENCE = {"measurements.md", "architecture.md", "planted.md", "paper.md"}
 
 
-@pytest.mark.parametrize("path", [*pages.pages(), *pages.NOTEBOOKS], ids=lambda path: path.stem)
-def test_words_are_plain(path):
-    found = [
+PACKAGE = Path(dgp.__file__).parent
+SOURCES = sorted(PACKAGE.rglob("*.py"))
+
+
+def idioms(parts):
+    """Every idiom in some texts, with what to write in its place."""
+    return [
         f"{match.group(0)!r} (write: {instead}) in: {part[:120]}"
-        for part in pages.prose(path)
+        for part in parts
         for idiom, instead in IDIOMS.items()
         if (match := re.search(idiom, part, flags=re.IGNORECASE))
     ]
+
+
+def shown(path):
+    """All texts that a file of the package may show: its literals, and of commands their help."""
+    tree = ast.parse(path.read_text())
+    holders = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    nodes = [node for node in ast.walk(tree) if isinstance(node, holders)]
+    docstrings = {id(n.body[0].value) for n in nodes if n.body and isinstance(n.body[0], ast.Expr)}
+    if "cli" in path.parts:
+        docstrings = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr):
+            yield "".join(v.value if isinstance(v, ast.Constant) else "..." for v in node.values)
+        elif isinstance(node, ast.Constant) and id(node) not in docstrings:
+            yield str(node.value)
+
+
+@pytest.mark.parametrize("path", [*pages.pages(), *pages.NOTEBOOKS], ids=lambda path: path.stem)
+def test_words_are_plain(path):
+    found = idioms(pages.prose(path))
     assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize("made", ["report", "nothing"])
+def test_words_of_a_report_are_plain(made):
+    """Its page, and what `print` shows of it."""
+    report = getattr(reports, made)()
+    text = re.sub(r"<(style|svg)\b.*?</\1>", " ", page(report), flags=re.DOTALL)
+    parts = re.split(r"</?(?:p|h\d|li|td|th|div|figcaption|aside|section|dd|dt)\b[^>]*>", text)
+    words = [" ".join(html.unescape(re.sub(r"<[^>]+>", " ", part)).split()) for part in parts]
+    assert len(" ".join(words)) > 1000
+    found = idioms([*words, *str(report).splitlines()])
+    assert not found, "\n".join(found)
+
+
+def test_words_of_messages_results_and_commands_are_plain():
+    """All that `print` of results, errors, warnings and the shell are put together from."""
+    found = {str(p.relative_to(PACKAGE)): hits for p in SOURCES if (hits := idioms(shown(p)))}
+    assert not found, "\n".join(f"{name}: {hits}" for name, hits in found.items())
 
 
 @pytest.mark.parametrize(
@@ -67,5 +115,13 @@ def test_sentences_are_short(path):
 def test_the_list_finds_what_it_names():
     """A sentence of private idioms, as the pages once had them, is refused by several rules."""
     text = "Bands do not know of it; the drift goes on, nothing has seen the end, and it pays."
-    hits = [idiom for idiom in IDIOMS if re.search(idiom, text, flags=re.IGNORECASE)]
-    assert len(hits) == 5
+    assert len(idioms([text])) == 5
+
+
+def test_messages_and_help_are_looked_at(tmp_path):
+    source = '"""It goes on."""\nx = f"it {1} goes on"\ndef f():\n    """It goes on."""\n'
+    for folder, count in (("cli", 4), ("data", 2)):  # parts of an f-string count again
+        (tmp_path / folder).mkdir()
+        path = tmp_path / folder / "file.py"
+        path.write_text(source)
+        assert len([text for text in shown(path) if idioms([text])]) == count

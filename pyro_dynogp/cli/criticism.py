@@ -25,7 +25,7 @@ def check(
 ) -> None:
     """Check a saved MODEL: its posterior, its bands, and forecasts of its training record.
 
-    Exit code 0 also where something speaks against the fit: the last line says so.
+    Exit code 0 also where a check fails: the last line names what to look at.
 
     \b
     Examples:

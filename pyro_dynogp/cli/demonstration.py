@@ -154,8 +154,8 @@ def run_demo(
 ) -> dict[str, Any]:
     """Identify the coupled drives by variational inference; write the model, scores and figures.
 
-    Then close the loop: a linear model does not know that the sensor reports the size of the speed
-    alone, and is to find out (`pyro_dynogp.close_loop`).
+    Then close the loop (`pyro_dynogp.close_loop`): the sensor reports the size of the speed alone,
+    which a linear model cannot describe.
 
     Args:
         output_directory: made where it is missing; files of earlier runs are overwritten.

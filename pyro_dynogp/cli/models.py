@@ -38,7 +38,7 @@ def made(kind: str, inputs: int, outputs: int, pairs: int | None) -> Any:
 
 
 def loaded(path: Path) -> Fit:
-    """A saved fit; what its bands leave out is told on the error stream."""
+    """A saved fit; notes on the error stream say what its bands leave out."""
     from pyro_dynogp import load
     from pyro_dynogp.inference.stability import warnings_of
 

@@ -78,8 +78,8 @@ READING = options(
         help="Whether the line under the header holds units; looked for if not given.",
     ),
     click.option("--encoding", metavar="NAME", help="Of the file, such as cp1252 [UTF-8]."),
-    click.option("--delimiter", metavar="CHAR", help="Between columns [told from the file]."),
-    click.option("--decimal", metavar="CHAR", help="Decimal mark, . or , [told from the file]."),
+    click.option("--delimiter", metavar="CHAR", help="Between columns [found from the file]."),
+    click.option("--decimal", metavar="CHAR", help="Decimal mark, . or , [found from the file]."),
     click.option("--thousands", metavar="CHAR", help="Separator of groups of three digits."),
 )  # fmt: skip
 CLOCK = options(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -21,6 +23,7 @@ from pyro_dynogp.inference.pareto import good_k, psis
 from pyro_dynogp.inference.posterior_draws import PosteriorDraws
 from pyro_dynogp.inference.stability import warnings_of
 from pyro_dynogp.prediction.predict import predict
+from pyro_dynogp.support.parallel import parallel_map
 from pyro_dynogp.support.shown import shown
 
 if TYPE_CHECKING:
@@ -110,7 +113,7 @@ def check(
             about four minutes of one core for 120 samples and a linear model of one pair.
         forecasts: whether to fit twice more, to parts of the record, and forecast the rest.
         draws: for Pareto's k, by default those that `loo` takes. seed: for them and for NUTS.
-        workers: processes for NUTS's chains. progress: whether NUTS shows a bar.
+        workers: processes for NUTS's chains. progress: whether to show bars.
 
     Raises:
         ValueError: where the fit does not know its training records; on a twin of a fit with
@@ -125,23 +128,24 @@ def check(
         one-step calibration
     """
     known_fit(fit)
-    findings: list[Finding] = []
     compared: list[Finding] = []
     if twin is not False:  # first: this is where it may be refused
         compared = twin_findings(fit, twin, seed=seed, workers=workers, progress=progress)
-    if fit.method == "nuts":
-        findings += _chains(fit)
-    else:
-        findings.append(_posterior(fit, draws, seed))
+    parts: list[Callable[[], Finding | list[Finding]]] = [
+        partial(_chains, fit) if fit.method == "nuts" else partial(_posterior, fit, draws, seed)
+    ]
     if fit.log_q_sites and fit.trajectories:
-        findings.append(_whole_vector(fit))
+        parts.append(partial(_whole_vector, fit))
     if fit.method == "svi":
-        findings.append(_elbo(fit))
-    findings.append(_starts(fit))
-    findings += [Finding("poles", np.nan, False, sentence) for sentence in warnings_of(fit)]
-    findings += _predictions(fit)
+        parts.append(partial(_elbo, fit))
+    parts += [partial(_starts, fit), partial(_poles, fit), partial(_predictions, fit)]
+    findings: list[Finding] = []
+    for found in parallel_map(
+        lambda part: part(), parts, workers=1, progress=progress, description="posterior"
+    ):
+        findings += [found] if isinstance(found, Finding) else found
     if forecasts:
-        findings += forecast_findings(fit, seed=seed)
+        findings += forecast_findings(fit, seed=seed, progress=progress)
     findings += compared
     return Check(tuple(findings), fit.method)
 
@@ -230,6 +234,10 @@ def _starts(fit: Fitted) -> Finding:
     if count == 1:
         text += ": raise restarts, or look at what another seed gives"
     return Finding("starts", float(count), None, text)
+
+
+def _poles(fit: Fitted) -> list[Finding]:
+    return [Finding("poles", np.nan, False, sentence) for sentence in warnings_of(fit)]
 
 
 def _predictions(fit: Fitted) -> list[Finding]:

@@ -59,7 +59,7 @@ def pointwise_log_density(
         expected="an observed site whose trajectories are integrated out (LTIProcess.observed, "
         "or a model of this package)",
         got=type(observed).__name__,
-        advice="Densities given a sampled trajectory, which has seen the sample itself, are off by "
+        advice="Densities given a trajectory that was drawn given the sample itself are off by "
         "tens of nats. Integrate the trajectory, or give `pointwise` densities of your own.",
     )
 

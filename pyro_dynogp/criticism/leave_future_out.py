@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.refit import refit
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.prediction.predict import forecast
+from pyro_dynogp.support.parallel import parallel_map
 
 if TYPE_CHECKING:
     from pyro_dynogp.inference.fitted import Fitted
@@ -43,7 +45,7 @@ class Stretch:
     chance: np.ndarray
 
 
-def forecast_findings(fit: Fitted, *, seed: int = 0) -> list[Finding]:
+def forecast_findings(fit: Fitted, *, seed: int = 0, progress: bool = False) -> list[Finding]:
     """Whether forecasts hold, from within the training record (leave-future-out).
 
     The model is fitted again, by the same method, to the first 60 and the first 80 % of every
@@ -56,7 +58,7 @@ def forecast_findings(fit: Fitted, *, seed: int = 0) -> list[Finding]:
     2499, 2020).
 
     Args:
-        fit: the fit. seed: of joint samples.
+        fit: the fit. seed: of joint samples. progress: whether to show a bar.
     """
     shortest = min(len(record) for record in fit.records)
     if not fit.collapsed or fit.method == "nuts":
@@ -65,26 +67,31 @@ def forecast_findings(fit: Fitted, *, seed: int = 0) -> list[Finding]:
     if shortest < FEWEST:
         text = f"not checked: {FEWEST} samples or more are needed, there are {shortest}"
         return [Finding(NAME, np.nan, None, text)]
-    stretches: list[Stretch] = []
-    for cut, end in pairwise(CUTS):
-        try:
-            stretches += _ahead(fit, cut, end, seed)
-        except ValueError as error:  # as where an input is constant before the cut
-            text = f"not checked: the first {100 * cut:.0f} % cannot be fitted alone ({error})"
-            return [Finding(NAME, np.nan, None, text)]
+    found = parallel_map(
+        partial(_ahead, fit, seed), list(pairwise(CUTS)), workers=1, progress=progress,
+        description=NAME,
+    )  # fmt: skip
+    for some in found:
+        if isinstance(some, str):
+            return [Finding(NAME, np.nan, None, some)]
+    stretches = [one for some in found for one in some if isinstance(one, Stretch)]
     return [_finding(stretches, fit.model.is_linear)] if stretches else []
 
 
-def _ahead(fit: Fitted, cut: float, end: float, seed: int) -> list[Stretch]:
-    """Forecasts from `cut` to `end`, shares of every record."""
+def _ahead(fit: Fitted, seed: int, ends: tuple[float, float]) -> list[Stretch] | str:
+    """Forecasts between two shares of every record, or why there are none."""
+    cut, end = ends
     past = [record[: int(cut * len(record))] for record in fit.records]
     future = [record[int(cut * len(record)) : int(end * len(record))] for record in fit.records]
-    again = refit(fit, past, run=Run(fit.seed, workers=1))
-    return [
-        _stretch(again, before, after, seed)
-        for before, after in zip(past, future, strict=True)
-        if np.isfinite(after.outputs).any(0).all()
-    ]
+    try:
+        again = refit(fit, past, run=Run(fit.seed, workers=1))
+        return [
+            _stretch(again, before, after, seed)
+            for before, after in zip(past, future, strict=True)
+            if np.isfinite(after.outputs).any(0).all()
+        ]
+    except ValueError as error:  # as where an input is constant before the cut
+        return f"not checked: the first {100 * cut:.0f} % cannot be fitted alone ({error})"
 
 
 def _stretch(fit: Fitted, past: Record, future: Record, seed: int) -> Stretch:

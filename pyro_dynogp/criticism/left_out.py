@@ -323,7 +323,7 @@ def _note(found: Found, subject: Subject) -> None:
         )
     if "at each optimum" in subject.draws.kind:
         found.notes.append(
-            "Poles, gains, noise and lengthscales are at their optimum, which has seen the data: "
+            "Poles, gains, noise and lengthscales are at their optimum, fitted to all data: "
             "fit with method='importance' (the default along 1000 samples or fewer) or 'nuts', or "
             "use target='new record', to count what they cost."
         )

@@ -153,8 +153,8 @@ def _elpd(subject: Subject, found: Found, target: str, horizon: int) -> Any:
     count = len(subject.draws)
     if found.left:
         found.notes.append(
-            f"{found.left} samples have a Pareto k above {good_k(count):.2f} and were "
-            "not fitted again: raise `refits`, or use target='new record'."
+            f"Samples with a Pareto k above {good_k(count):.2f} that were not fitted again: "
+            f"{found.left}. Raise `refits`, or use target='new record'."
         )
     order = np.argsort(found.index)
     return arviz_bridge.elpd_data(

@@ -65,8 +65,7 @@ def draws_of(
             "fit",
             expected="a posterior that can be drawn from",
             got=f"a posterior mode around which Laplace's approximation is useless (k = {shape})",
-            advice="Fit with method='svi' (the default of cascades) or 'nuts', or use "
-            "parameters='mode'.",
+            advice="Fit with the default method or 'nuts', or use parameters='mode'.",
         )
     found = sample_around(
         fit.model.collapsed, _data(fit), [fit.mode], count=count, seed=seed, progress=progress

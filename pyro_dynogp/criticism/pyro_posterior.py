@@ -88,7 +88,7 @@ class PyroPosterior:
                     "model",
                     expected="a model whose trajectories are all integrated out",
                     got=f"latent trajectories {list(self.trajectories)}",
-                    advice="They have seen the sample that they would have to predict.",
+                    advice="They were fitted to the sample that they would have to predict.",
                 )
             found = [
                 integrated_density(distribution, value, kind, horizon)
@@ -182,7 +182,9 @@ class PyroPosterior:
 
     def _log_likelihood(self) -> dict[str, Variable]:
         out = {}
-        given = f" Given latent trajectories {list(self.trajectories)}, which have seen the data."
+        given = (
+            f" Given latent trajectories {list(self.trajectories)}, which were fitted to the data."
+        )
         for name, value in self.observed.items():
             integrated = is_integrated(self.sites[name][0])
             each = [

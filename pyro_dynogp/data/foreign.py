@@ -178,6 +178,6 @@ def holidays_of(
         argument = "subdivision" if "subdivision" in str(error) else "country"
         got = repr(subdivision if argument == "subdivision" else country)
         raise invalid(
-            argument, expected="a code that the package holidays knows", got=f"{got} ({error})"
+            argument, expected="a code that the package holidays has", got=f"{got} ({error})"
         ) from error
     return np.isin(stamps.date, list(dates)).astype(np.float64)

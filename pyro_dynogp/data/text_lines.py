@@ -80,12 +80,12 @@ def read_lines(path: Path, encoding: str | None = None, skip_rows: int = 0) -> L
         delimiter, begin = match[1], max(1, skip_rows)
     else:
         delimiter, begin = None, skip_rows
-    kept = [
-        (number, text.strip("\r\n "))
+    numbers = [
+        number
         for number, text in enumerate(all_lines[begin:], begin + 1)
         if text[:1] not in "#% \t\r\n" or (text.strip() and text.lstrip()[0] not in "#%")
     ]
-    return Lines([text for _, text in kept], [number for number, _ in kept], delimiter)
+    return Lines([all_lines[k - 1].strip("\r\n ") for k in numbers], numbers, delimiter)
 
 
 def encoding_of(path: Path) -> str:

@@ -1,17 +1,15 @@
 """The cells of a text file: delimiter, header and line numbers, as plant loggers write them.
 
-Cells are split by `str.split` or the standard library's csv module, not by pandas: their lines are
-known for the errors, and short rows are allowed. Numbers and stamps are converted a column at a
-time, stamps by pandas. Files of plain numbers are read by pandas alone (`plain_numbers`).
+Cells are not split by pandas: their lines are known for the errors, and short rows are allowed.
+Numbers and stamps are converted a column at a time, stamps by pandas. Files of plain numbers are
+read by pandas alone (`plain_numbers`).
 """
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import itertools
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +20,7 @@ from pyro_dynogp.data.checks import Array
 from pyro_dynogp.data.columns import named_column
 from pyro_dynogp.data.numerals import Numerals, decimal_mark, no_number
 from pyro_dynogp.data.plain_numbers import plain_numbers, whole_file
+from pyro_dynogp.data.text_cells import blocks, split_cells
 from pyro_dynogp.data.text_layout import Layout
 from pyro_dynogp.data.text_lines import OPENERS, read_lines
 from pyro_dynogp.data.time_stamps import is_stamp, localise, read_stamps
@@ -120,22 +119,17 @@ def read_table(path: Path, layout: Layout | None = None) -> TextTable:
         rest = (cell.strip(' "') for text in texts[HEAD:] for cell in text.split(mark))
         decimal = decimal_mark([cell for row in top for cell in row], rest, mark, path)
         form = dataclasses.replace(form, decimal=decimal)
-    names, header = layout.names, layout.header
-    if header is None:
-        header = names is None and not all(_is_data(cell, form) for cell in top[0])
-    titles = top[0] if header else []
+    header, given = _titles(layout, top[0], form)
     second = _units_row(top[int(header) :], header, layout.units_row, form)
     begin, end = int(header) + bool(second), len(texts)
     while end > begin and not texts[end - 1].strip(mark + ' "'):
         end -= 1
     if end <= begin:
         raise invalid("path", expected="a file with a line of data", got=f"{path}, a header alone")
-    given = list(names) if names is not None else titles if header else [""] * len(top[0])
-    lines = lines[begin:end]
-    columns = _columns(texts[begin:end], lines, mark, path, len(given), head)
-    width = len(given) if names is not None else max(len(columns), _width(titles))
-    unnamed = not header and names is None
-    labels = [str(i) for i in range(width)] if unnamed else _block_names(given[:width])
+    lines, most = lines[begin:end], len(top[0] if given is None else given)
+    columns = _columns(texts[begin:end], lines, mark, path, most, head)
+    width = most if layout.names is not None else max(len(columns), _width(given or []))
+    labels = _labels(given, width)
     columns += [[""] * len(lines)] * (width - len(columns))
     named = dict(zip(labels, columns, strict=False))
     if len(named) != len(labels):
@@ -149,7 +143,7 @@ def read_table(path: Path, layout: Layout | None = None) -> TextTable:
 
 def _rows(texts: list[str], mark: str, path: Path) -> list[list[str]]:
     """Cells of every line, without the white space around them."""
-    return [[cell.strip() for cell in row] for block in _blocks(texts, mark, path) for row in block]
+    return [[cell.strip() for cell in row] for block in blocks(texts, mark, path) for row in block]
 
 
 def _units_row(
@@ -183,7 +177,7 @@ def _columns(
         ValueError: a line of more cells than `most`, of quotes that are not closed.
     """
     whole = "\n".join(texts)
-    flat, width = _cells(whole, texts, mark, path)
+    flat, width = split_cells(whole, texts, mark, path)
     if any(space in whole for space in (mark + " ", " " + mark, '" ', ' "', "\t", "\u00a0")):
         flat = [cell.strip() for cell in flat]
     columns = [flat[i::width] for i in range(width)]
@@ -203,47 +197,6 @@ def _columns(
             got=f"{width} on line {line}", advice=advice,
         )  # fmt: skip
     return columns
-
-
-def _cells(whole: str, texts: list[str], mark: str, path: Path) -> tuple[list[str], int]:
-    """All cells, row by row, and how many a row has; short rows are filled up with empty ones.
-
-    No list is kept for every row, as so many keep the collector busy: 200 000 rows with quotes take
-    0.44 s so, and 0.85 s with a list each; without quotes they are split at once, 0.3 s.
-    """
-    counts = {text.count(mark) for text in texts}
-    if '"' not in whole and len(counts) == 1:
-        return whole.replace("\n", mark).split(mark), counts.pop() + 1
-    width = 0
-    for block in _blocks(texts, mark, path):
-        width = max(width, *map(len, block))
-    flat: list[str] = []
-    for block in _blocks(texts, mark, path):
-        for row in block:
-            flat += row
-            if len(row) < width:
-                flat += [""] * (width - len(row))
-    return flat, width
-
-
-def _blocks(texts: list[str], mark: str, path: Path) -> Iterator[list[list[str]]]:
-    """Rows of cells, some at a time, as the csv module splits them.
-
-    Raises:
-        ValueError: a quotation mark that is not closed, or a cell of several lines.
-    """
-    reader, count = csv.reader(texts, delimiter=mark), 0
-    try:
-        while block := list(itertools.islice(reader, 1000)):
-            count += len(block)
-            yield block
-    except csv.Error as error:
-        raise invalid(
-            "path", expected="a file of columns", got=f"{path}, in which a {error}",
-            advice="A quotation mark that is not closed makes one cell of many.",
-        ) from error  # fmt: skip
-    if count != len(texts):
-        raise invalid("path", expected="one row on each line", got="a quoted cell of several lines")
 
 
 def _header_line(head: Sequence[tuple[int, Sequence[str]]]) -> int:
@@ -274,14 +227,13 @@ def _plain_table(path: Path, layout: Layout) -> TextTable | None:
             return None
     except ValueError:  # not told by the first lines: the others are asked, too
         return None
-    header, names = layout.header, layout.names
-    if header is None:
-        header = names is None and not all(_is_data(cell, Numerals()) for cell in rows[0])
+    header, given = _titles(layout, rows[0], Numerals())
     width = len(rows[1])
-    given = list(names) if names is not None else rows[0] if header else [""] * width
-    labels = _block_names(given) if header or names is not None else [str(i) for i in range(width)]
-    if len(given) != width or len(set(labels)) != width:
+    labels = _labels(given, width)
+    if len(given or labels) != width or len(set(labels)) != width:
         return None
+    if any(Numerals().value(cell) is None for row in rows[header:] for cell in row):
+        return None  # as of time stamps: not read twice
     values = plain_numbers(data, mark, width, header)
     if values is None:
         return None
@@ -296,6 +248,19 @@ def sniff(texts: Sequence[str]) -> str:
 def _width(row: Sequence[str]) -> int:
     """Count the cells up to the last one that is not empty."""
     return next((i for i in range(len(row), 0, -1) if row[i - 1]), 0)
+
+
+def _titles(layout: Layout, first: list[str], form: Numerals) -> tuple[bool, list[str] | None]:
+    """Whether the first line is a header, and the names that are stated; None where none are."""
+    header, names = layout.header, layout.names
+    if header is None:
+        header = names is None and not all(_is_data(cell, form) for cell in first)
+    return header, list(names) if names is not None else first if header else None
+
+
+def _labels(given: list[str] | None, width: int) -> list[str]:
+    """Names of so many columns: as stated, or their numbers."""
+    return [str(i) for i in range(width)] if given is None else _block_names(given[:width])
 
 
 def _block_names(names: Sequence[str]) -> list[str]:

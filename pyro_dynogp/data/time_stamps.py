@@ -44,9 +44,9 @@ def read_stamps(
     if time_format is not None:
         return _formatted(cells, lines, column, time_format)
     matches = [_ISO.fullmatch(shape) for shape in _shapes(cells)]
-    zoned = {match["zone"] is not None for match in matches if match}
-    if all(matches) and len(zoned) == 1:
-        return _iso(cells, zoned.pop())
+    zones = {match["zone"] for match in matches if match}
+    if all(matches) and (None not in zones or len(zones) == 1):
+        return _iso(cells, zones)
     if _LOCAL.fullmatch(cells[0]) and not _ISO.fullmatch(cells[0]):
         return _guessed(cells, lines, column)
     raise _mixed(cells, lines, column)
@@ -66,13 +66,13 @@ def _mixed(cells: Sequence[str], lines: Sequence[int], column: str) -> ValueErro
     )
 
 
-def _iso(cells: Sequence[str], zoned: bool) -> pd.DatetimeIndex:
-    """ISO 8601 stamps, which have a zone all or none; one zone is kept, several become UTC."""
+def _iso(cells: Sequence[str], zones: set[str | None]) -> pd.DatetimeIndex:
+    """ISO 8601 stamps, whose zones have these shapes; one zone is kept, several become UTC."""
     plain = [cell.replace(",", ".") for cell in cells]
+    shape, *others = zones
     try:
-        stamps = pd.DatetimeIndex(pd.to_datetime(plain, format="ISO8601", utc=zoned))
-        matches = [_ISO.fullmatch(cell) for cell in cells] if zoned else []
-        if len({match["zone"] for match in matches if match}) == 1:
+        stamps = pd.DatetimeIndex(pd.to_datetime(plain, format="ISO8601", utc=shape is not None))
+        if shape is not None and not others and len({c[-len(shape) :] for c in cells}) == 1:
             stamps = stamps.tz_convert(pd.Timestamp(plain[0]).tz)
     except ValueError as error:
         raise invalid("time", expected="ISO 8601 time stamps", got=str(error)) from error

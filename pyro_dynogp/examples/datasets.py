@@ -184,8 +184,8 @@ def _vic_elec(test: str = "paper") -> Dataset:
     else:
         protocol += f"test on the {len(year_2014)} from 31 December 2013 to the end of 2014."
     source = (
-        "Australian Energy Market Operator (demand) and Bureau of Meteorology (temperature), by "
-        "way of the R package tsibbledata"
+        "Australian Energy Market Operator (demand) and Bureau of Meteorology (temperature), "
+        "through the R package tsibbledata"
     )
     chosen = second_half if test == "paper" else year_2014
     return Dataset(

@@ -32,7 +32,7 @@ def known_fit(fit: object, argument: str = "fit") -> None:
     """
     instance(argument, fit, Fitted, "dgp.fit(...) makes one.")
     if not getattr(fit, "records", ()):
-        raise invalid(argument, expected="a fit that knows its training records", got="none")
+        raise invalid(argument, expected="a fit that has its training records", got="none")
 
 
 @dataclass(frozen=True, eq=False)

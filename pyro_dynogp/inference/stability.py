@@ -34,7 +34,10 @@ def _slow(fit: Fitted) -> list[str]:
         pole = max(layer.modes.poles[: made.pairs].tolist(), key=lambda pole: pole.real)
         held = -pole.real * duration
         if held < FEWEST:
-            kind, advice = "all but integrates", "set integrators=1 if the plant integrates, "
+            kind, advice = (
+                "is hardly different from an integrator",
+                "set integrators=1 if the plant integrates, ",
+            )
             if abs(pole.imag) > 2.0 * abs(pole.real):
                 kind, advice = "oscillates on", "add a Sinusoid for what oscillates outside, "
             elif made.integrators:

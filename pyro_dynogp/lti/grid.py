@@ -90,6 +90,11 @@ def time_grid(time: Numbers | TimeGrid) -> TimeGrid:
     return TimeGrid(t, torch.as_tensor(distinct[repeated:], device=t.device), index)
 
 
+def held(x: Tensor, parts: int) -> Tensor:
+    """Values (*b, n, c) of each sample at all parts of the step that follows it, see `divided`."""
+    return x if parts == 1 else x.repeat_interleave(parts, -2)[..., : 1 - parts, :]
+
+
 def _distinct(differences: np.ndarray, rounding: float) -> tuple[np.ndarray, np.ndarray]:
     """Distinct steps (m,), rising, and which of them each difference (n - 1,) is.
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from pyro_dynogp.layers.functions import StaticFunction
 from pyro_dynogp.lti.covariance import step_noises
 from pyro_dynogp.lti.fused import propagators
-from pyro_dynogp.lti.grid import TimeGrid
+from pyro_dynogp.lti.grid import TimeGrid, held
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import mean_response
 from pyro_dynogp.models.filter_functions import Block, functions_of, inducing_range
@@ -68,11 +68,9 @@ class Assembly:
 
     def with_outputs(self, y: Tensor) -> FilterProblem:
         """The problem with scaled outputs y (*b, n, n_y), NaN where missing."""
-        if self.substeps > 1:
-            wide = y.new_full((*y.shape[:-2], self.problem.y.shape[-2], y.shape[-1]), torch.nan)
-            wide[..., :: self.substeps, :] = y
-            y = wide
-        return replace(self.problem, y=y)
+        wide = y.new_full((*y.shape[:-2], self.problem.y.shape[-2], y.shape[-1]), torch.nan)
+        wide[..., :: self.substeps, :] = y
+        return replace(self.problem, y=wide)
 
 
 def count_states(system: System) -> int:
@@ -322,17 +320,11 @@ def assemble(
     """
     noise_sd = system.noise_sd(inputs, grid) if noise_sd is None else noise_sd
     parts = system.substeps
-    grid, inputs = grid.divided(parts), _held(inputs, parts)
-    walk = _Assembler(system, grid, inputs)
+    walk = _Assembler(system, grid.divided(parts), held(inputs, parts))
     for place, layer in zip(system.wires, system.layers, strict=True):
         if isinstance(layer, DynamicSystem):
             walk.signals |= walk.dynamic(place, layer)
         else:
             walk.signals[place.name] = walk.static(place, layer)
-    noise_sd = noise_sd if noise_sd.shape[-2] == 1 else _held(noise_sd, parts)
+    noise_sd = noise_sd if noise_sd.shape[-2] == 1 else held(noise_sd, parts)
     return replace(walk.finish(noise_sd), substeps=parts)
-
-
-def _held(x: Tensor, parts: int) -> Tensor:
-    """Values (*b, n, c) of each sample for all parts of the step that follows it."""
-    return x if parts == 1 else x.repeat_interleave(parts, -2)[..., : 1 - parts, :]

@@ -111,7 +111,7 @@ def _told(folder: Path) -> Iterator[None]:
         raise OSError(
             error.errno or errno.EIO,
             f"checkpoint: {folder} cannot be written to ({why}). What was finished before is kept "
-            "there: the same call goes on from it once there is room and leave to write",
+            "there: the same call continues from it once there is room and leave to write",
         ) from error
 
 

@@ -95,7 +95,7 @@ def _content(value: object) -> Iterator[object]:
         except TypeError as error:
             raise invalid(
                 "checkpoint",
-                expected="a model and a method that can be told from others by their content",
+                expected="a model and a method that their content identifies",
                 got=f"a {type(value).__name__} in them",
             ) from error
 

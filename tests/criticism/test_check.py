@@ -116,5 +116,5 @@ def test_a_cascade_with_trajectories_as_sites(bent):
 
 
 def test_without_records(good):
-    with pytest.raises(ValueError, match="fit: expected a fit that knows its training records"):
+    with pytest.raises(ValueError, match="fit: expected a fit that has its training records"):
         dgp.check(replace(good, records=()))

@@ -260,7 +260,7 @@ class TestLatentTrajectory:
 
     def test_export_says_what_they_are_given(self, found):
         data = found.to_arviz()
-        assert "seen the data" in data.log_likelihood["y"].attrs["kind"]
+        assert "fitted to the data" in data.log_likelihood["y"].attrs["kind"]
         assert data.posterior["g"].shape == (1, 4, 2, models.N)
         assert data.posterior_predictive["y"].shape == (1, 4, 2, models.N)
 

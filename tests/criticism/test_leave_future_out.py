@@ -86,6 +86,16 @@ def test_a_part_that_cannot_be_fitted_is_said(monkeypatch):
     assert "the first 60 % cannot be fitted alone (record: expected more.)" in found.text
 
 
+def test_bars_are_shown_where_they_are_wanted(capfd):
+    fit = dgp.fit(FIRST, machine(1, 60), method="map", **QUIET)
+    shown, quiet = dgp.check(fit, workers=1), dgp.check(fit, **QUIET)
+    assert str(shown) == str(quiet)
+    bars = capfd.readouterr().err
+    assert "posterior: 100%" in bars
+    assert "forecasts: 100%" in bars
+    assert bars.count("\n") == 2  # none of the quiet one
+
+
 @pytest.mark.parametrize(
     ("inside", "low", "known", "good"),
     [

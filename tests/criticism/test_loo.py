@@ -299,7 +299,7 @@ def test_what_is_refused(linear, short):
         dgp.loo(linear, target="missing sample", refits=-1, **QUIET)
     with pytest.raises(ValueError, match="fit: expected a Fit, or a Subject"):
         dgp.loo("fit", target="missing sample", **QUIET)
-    with pytest.raises(ValueError, match="knows its training records"):
+    with pytest.raises(ValueError, match="has its training records"):
         dgp.loo(replace(linear, records=()), target="missing sample", **QUIET)
     with pytest.raises(ValueError, match="without refits for a model of your own"):
         dgp.loo(NormalMean().subject, target="new record", **QUIET)

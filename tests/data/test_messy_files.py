@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pyro_dynogp.data import text_table
+from pyro_dynogp.data import text_cells, text_table
 from pyro_dynogp.data.numerals import Numerals, decimal_mark
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.time_stamps import read_stamps
@@ -255,11 +255,49 @@ class TestStamps:
         assert record.outputs[:, 0].tolist() == [1.5, 2.5]
 
 
-def test_ways_of_splitting_agree(write):
-    """Lines all alike are split at once, others by the csv module."""
+# Quotation marks -> whether each pair of them has one whole cell in it.
+QUOTED = {
+    '"7","7.5"': True,
+    '7,"7.5"': True,
+    '"","7.5"': True,
+    '"a b","Grüße"': True,
+    '"7", 7.5': True,
+    '7, "7.5"': False,
+    '"7" ,7.5': False,
+    '"7,7",7.5': False,
+    '","': False,
+    '",",","': False,
+    '"say ""7""",7.5': False,
+    '"7"7,7.5': False,
+    '7"7",7.5': False,
+    '"""",7.5': False,
+    '"7,"7.5"': False,
+    '7,"': False,
+    '"7\r",7.5': False,
+}
+
+
+@pytest.mark.parametrize("cells", QUOTED)
+def test_ways_of_splitting_agree(cells, write, monkeypatch):
+    """Lines all alike are split at once, also without their quotation marks, or as csv does."""
+    text = '"u","y"\n' + "".join(f'{i},"{i}.5"\n' for i in range(60)) + cells + "\n"
+    assert (text_cells.unquoted(text, ",") is not None) == QUOTED[cells]
+
+    def read():
+        try:
+            table = text_table.read_table(write(text))
+            return {name: list(column) for name, column in table.columns.items()}
+        except ValueError as error:
+            return str(error)
+
+    at_once = read()
+    monkeypatch.setattr(text_cells, "unquoted", lambda whole, mark: None)
+    assert read() == at_once
+
+
+def test_short_lines_and_long_ones_agree_with_csv(write):
     text = "u,y\n" + "".join(f"{i}, {i}.5 \n" for i in range(60))
-    at_once = text_table.read_table(write(text))
-    one_by_one = text_table.read_table(write(text.replace("7, 7.5", '"7", 7.5')))
-    assert {k: list(v) for k, v in at_once.columns.items()} == {
-        k: list(v) for k, v in one_by_one.columns.items()
+    at_once, filled = (text_table.read_table(write(t)) for t in (text, text + "60\n"))
+    assert {name: list(column)[:60] for name, column in filled.columns.items()} == {
+        name: list(column) for name, column in at_once.columns.items()
     }

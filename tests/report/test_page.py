@@ -148,7 +148,7 @@ def test_figures(made, found):
 
 def test_ties(found):
     assert "These data cannot tell this effect from “drift” and “calendar”." in found.text
-    assert f"To tell them apart: {reports.EXPERIMENT}" in found.text
+    assert f"To distinguish them: {reports.EXPERIMENT}" in found.text
     assert found.text.count("Tie.") == 1
 
 

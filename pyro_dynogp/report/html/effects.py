@@ -79,7 +79,7 @@ def _ties(effect: FoundEffect) -> str:
     others = listed([f"“{name}”" for name in effect.ties])
     words = f"These data cannot tell this effect from {others}."
     if effect.experiment:
-        words += f" To tell them apart: {effect.experiment.rstrip('.')}."
+        words += f" To distinguish them: {effect.experiment.rstrip('.')}."
     return f'<aside class="tie"><strong>Tie. </strong>{text(words)}</aside>'
 
 

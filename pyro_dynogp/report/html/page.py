@@ -141,7 +141,7 @@ def _models(report: LoopResult) -> str:
     return (
         f"<h3>Before</h3><figure>{diagram(before, gone, 'Model before')}</figure>"
         f"<h3>After</h3><figure>{diagram(after, marks(before, after), 'Model after')}"
-        f"<figcaption>{_HOW_TO_READ} Those that are new or changed have a thick border and say so."
+        f"<figcaption>{_HOW_TO_READ} New and changed ones have a thick border and are marked."
         "</figcaption></figure>"
     )
 
