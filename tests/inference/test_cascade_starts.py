@@ -1,5 +1,6 @@
 """Starting points of a cascade: which restart takes which linear optimum."""
 
+import pytest
 import torch
 
 import pyro_dynogp as dgp
@@ -84,3 +85,31 @@ def test_starts_climb_without_process_noise_first(monkeypatch, bent):
         assert torch.equal(start["f_values"], optimum.values["f_values"])
         # What the deterministic model lacks is as at the start.
         assert torch.equal(start["g_noise_gain_unit"], first[0]["g_noise_gain_unit"])
+
+
+@pytest.mark.parametrize(
+    ("model", "count"),
+    [
+        (dgp.Wiener(1, pairs=1, inducing=4), 8),
+        (dgp.NonlinearFeedback(1, inducing=4), 4),
+        (dgp.NonlinearFeedback(1, inducing=4, hidden=1), 8),
+    ],
+    ids=["function", "feedback", "feedback of a hidden signal"],
+)
+def test_restarts_by_default(model, count, monkeypatch):
+    asked = []
+
+    class DoneError(Exception):
+        pass
+
+    def starts_of(model, records, twins, count, seed):
+        asked.append(count)
+        raise DoneError
+
+    monkeypatch.setattr(cascade_fit, "starts_of", starts_of)
+    record = dgp.datasets.load("gas_furnace").train[:60]
+    with pytest.raises(DoneError):
+        dgp.fit(model, record, method="map", steps=2, workers=1, progress=False)
+    with pytest.raises(DoneError):
+        dgp.fit(model, record, method="map", steps=2, restarts=3, workers=1, progress=False)
+    assert asked == [count, 3]
