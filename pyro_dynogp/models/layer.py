@@ -40,10 +40,10 @@ class Dynamic:
         hidden: number of further signals of the same states, which nothing measures: a velocity
             beside a position, a level in another tank. Functions see them by the name of the layer
             and "_hidden", as in ``Static(sees=("g_hidden",))``; in models with feedback.
-        substeps: equal parts of each step from sample to sample in which what comes back is
-            computed anew. With 1 it is held for the whole step, which is too long for a function
+        substeps: equal parts of each interval between samples in which functions in feedback are
+            computed anew. With 1 they are held from sample to sample, which is too long for one
             that changes faster (friction of a mass that stops between two samples); the work grows
-            with their number.
+            with their number. Not beside dead times that are parameters.
         name: prefix of its sites; g, or g1, g2, ... by default.
 
     Examples:

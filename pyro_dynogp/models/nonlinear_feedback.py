@@ -8,6 +8,7 @@ from gpytorch.kernels import Kernel
 
 from pyro_dynogp.layers.kernels import ROUGH, SMOOTH
 from pyro_dynogp.layers.noise import Gaussian, Likelihood
+from pyro_dynogp.models.arrival import free_delays
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.step import SUBSTEPS, Step
 from pyro_dynogp.models.structure import ModelOptions
@@ -32,8 +33,8 @@ def NonlinearFeedback(
     """Linear dynamics g whose output comes back through a static nonlinearity f.
 
     A spring or friction that is not linear, a tank that empties through a valve:
-    x' = A x + B u + F f(C x), y = C x + D u, with f held for a part of a step. Beyond the data f
-    keeps its value. With hidden signals a second function f2 of h = H x comes back, too, and f is
+    x' = A x + B u + F f(C x), y = C x + D u, with f held for a step or a part of it. Beyond the
+    data f keeps its value. With hidden signals there is a second function f2 of h = H x, and f is
     named f1: friction where the position is measured, a tank above the one that is. A `Step` beside
     them is what Gaussian processes are too smooth for: a friction that changes sign, an edge that
     a tank flows over.
@@ -44,8 +45,8 @@ def NonlinearFeedback(
         hidden: number of signals that f2 sees and has as outputs.
         step: whether a step of the hidden signal, or of the output where there is none, comes back
             as well; by default with one hidden signal.
-        substeps: equal parts of each step from sample to sample in which what comes back is
-            computed anew; by default 3 where a step comes back, else 1.
+        substeps: equal parts of each interval between samples in which the functions are computed
+            anew; by default 3 with a `Step`, 1 without and beside dead times that are parameters.
         kernel: of the functions, a gpytorch kernel; Matern-5/2 by default.
 
     Examples:
@@ -68,7 +69,7 @@ def NonlinearFeedback(
     back: tuple[str, ...] = ("f1", "f2") if hidden else ("f1",) if step else ("f",)
     back = (*back, "step") if step else back
     if substeps is None:
-        substeps = SUBSTEPS if step else 1
+        substeps = SUBSTEPS if step and not free_delays(options.get("channels", ())) else 1
     smoothness = SMOOTH if kernel is None else ROUGH
     layers: list[Layer] = [
         Dynamic(

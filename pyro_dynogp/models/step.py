@@ -11,7 +11,7 @@ from pyro_dynogp.support.frozen import FrozenMapping
 
 # Of the logarithm of a width in standard deviations of the signal: most from 0.02 to 1.
 WIDTH, SPREAD = -2.0, 1.0
-# Parts of a step between samples in which feedback with a step is computed anew by default.
+# Parts of each interval between samples in which feedback with a step is computed anew by default.
 SUBSTEPS = 3
 
 

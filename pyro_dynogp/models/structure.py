@@ -137,7 +137,7 @@ class Structure:
 
     @property
     def substeps(self) -> int:
-        """Parts of a step in which what comes back is computed anew."""
+        """Parts of each interval between samples in which feedback is computed anew."""
         return substeps_of(self.wires)
 
     @property

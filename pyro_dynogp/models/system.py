@@ -244,7 +244,7 @@ class System:
 
     @property
     def substeps(self) -> int:
-        """Parts of a step in which what comes back is computed anew."""
+        """Parts of each interval between samples in which feedback is computed anew."""
         return substeps_of(self.wires)
 
     @property

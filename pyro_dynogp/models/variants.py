@@ -165,7 +165,7 @@ def with_feedback(model: Model, *, output: bool = True, hidden: bool = False) ->
     for wire, other in zip(model.wires, model.layers, strict=True):
         sees = () if wire.sources == (INPUTS,) and not layers else wire.sources
         if isinstance(other, Dynamic) and wire.name == seen.name:
-            parts = max(layer.substeps, SUBSTEPS if hidden else 1)
+            parts = max(layer.substeps, SUBSTEPS if hidden and not model.late else 1)
             other = replace(
                 other, feedback=names, hidden=max(layer.hidden, int(hidden)), substeps=parts
             )

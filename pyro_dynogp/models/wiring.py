@@ -20,7 +20,7 @@ from pyro_dynogp.support.errors import COUNT, RULES, instance, invalid, whole
 INPUTS = "inputs"
 # What follows a layer's name in that of its hidden signals.
 HIDDEN = "_hidden"
-# Most parts of a step.
+# Most parts of an interval between samples.
 MOST_SUBSTEPS = 64
 
 
@@ -198,7 +198,7 @@ def _letter(layer: Layer) -> str:
 
 
 def substeps_of(wires: Sequence[Wire]) -> int:
-    """Parts of a step in which what comes back is computed anew: the most that a layer has."""
+    """Parts of an interval in which feedback is computed anew: the most that a layer has."""
     return max((w.layer.substeps for w in wires if isinstance(w.layer, Dynamic)), default=1)
 
 
@@ -304,7 +304,7 @@ def _check_limits(name: str, layer: Static, channels: int, last: bool) -> None:
 
 
 def _check_substeps(wires: Sequence[Wire]) -> None:
-    """Refuse substeps of a layer to which nothing comes back: they change nothing."""
+    """Refuse substeps of a layer without feedback: they change nothing."""
     for w in wires:
         if isinstance(w.layer, Dynamic):
             whole(1, MOST_SUBSTEPS).check(f"substeps of layer {w.name!r}", w.layer.substeps)

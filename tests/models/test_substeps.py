@@ -14,6 +14,7 @@ from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.models.moment_outputs import quiet_last_steps
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.prepared import PreparedRecord
+from pyro_dynogp.models.variants import with_feedback
 from tests.models.closed_loops import (
     check_gradient,
     make_record,
@@ -154,7 +155,10 @@ class TestRefused:
         channels = (dgp.Delayed("u"),)
         with pytest.raises(ValueError, match="substeps: expected 1 beside a dead time"):
             dgp.NonlinearFeedback(2, substeps=2, channels=channels)
-        dgp.NonlinearFeedback(2, channels=channels)
+        for hidden in (0, 1):
+            assert dgp.NonlinearFeedback(2, hidden=hidden, channels=channels).substeps == 1
+            late = with_feedback(dgp.LinearDynamicGP(2, channels=channels), hidden=bool(hidden))
+            assert late.substeps == 1
 
 
 def test_defaults():
@@ -168,6 +172,10 @@ def test_defaults():
     assert parts(dgp.NonlinearFeedback(1, step=True)) == 3
     assert parts(dgp.NonlinearFeedback(1, hidden=1, step=False)) == 1
     assert parts(dgp.NonlinearFeedback(1, hidden=1, substeps=2)) == 2
+    linear = dgp.LinearDynamicGP(1)
+    assert parts(with_feedback(linear)) == 1
+    assert parts(with_feedback(linear, hidden=True)) == 3
+    assert parts(with_feedback(dgp.NonlinearFeedback(1, substeps=5), hidden=True)) == 5
 
 
 def test_files_keep_them(tmp_path):

@@ -82,12 +82,7 @@ class Problem:
         if len(self.records) > 1 or len(self.records[0]) < LONG:
             return None
         part = self.records[0].head(EXCERPT)
-        variances = [
-            np.nanvar(signals.numpy(), axis=0)
-            for one in (part, self.records[0])
-            for signals in (one.scaled_inputs, one.scaled_outputs)
-        ]
-        few, whole = np.concatenate(variances[:2]), np.concatenate(variances[2:])
+        few, whole = _variances(part), _variances(self.records[0])
         return replace(self, records=(part,)) if (few >= LIVELY * whole).all() else None
 
     def fitted(
@@ -105,6 +100,14 @@ class Problem:
             self.model, posterior, FrozenMapping(draws), FrozenMapping(mode), history,
             np.asarray(energies), FrozenMapping(diagnostics), run.seed, as_measured(self.records),
         )  # fmt: skip
+
+
+def _variances(record: PreparedRecord) -> np.ndarray:
+    """Of all scaled signals; zero where nothing is measured."""
+    signals = np.concatenate([record.scaled_inputs.numpy(), record.scaled_outputs.numpy()], 1)
+    count = np.maximum((~np.isnan(signals)).sum(0), 1)
+    off = signals - np.nansum(signals, 0) / count
+    return np.asarray(np.nansum(off**2, 0) / count)
 
 
 class Method(Protocol):
