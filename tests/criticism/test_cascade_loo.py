@@ -27,7 +27,7 @@ def left_out(fit):
 
 
 def test_single_samples_against_a_sampler_that_never_saw_them(fit, left_out):
-    real, own_error = exact(fit, CHOSEN, times=4)
+    real, own_error = exact(fit, CHOSEN, times=6)
     ours = left_out.loo_i.values[CHOSEN]
     subject = FitSubject(fit, fit.records, 0, 0)
     density = subject.pointwise("missing sample")[:, CHOSEN]
