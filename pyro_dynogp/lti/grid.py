@@ -91,7 +91,7 @@ def time_grid(time: Numbers | TimeGrid) -> TimeGrid:
 
 
 def held(x: Tensor, parts: int) -> Tensor:
-    """Values (*b, n, c) of each sample at all parts of the step that follows it, see `divided`."""
+    """Values (*b, n, c) of each sample at all parts of the step after it; a single row stays so."""
     return x if parts == 1 else x.repeat_interleave(parts, -2)[..., : 1 - parts, :]
 
 

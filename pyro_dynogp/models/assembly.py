@@ -68,9 +68,10 @@ class Assembly:
 
     def with_outputs(self, y: Tensor) -> FilterProblem:
         """The problem with scaled outputs y (*b, n, n_y), NaN where missing."""
-        wide = y.new_full((*y.shape[:-2], self.problem.y.shape[-2], y.shape[-1]), torch.nan)
-        wide[..., :: self.substeps, :] = y
-        return replace(self.problem, y=wide)
+        if self.substeps > 1:
+            given, y = y, self.problem.y.expand(*y.shape[:-2], -1, -1).clone()
+            y[..., :: self.substeps, :] = given
+        return replace(self.problem, y=y)
 
 
 def count_states(system: System) -> int:
@@ -326,5 +327,4 @@ def assemble(
             walk.signals |= walk.dynamic(place, layer)
         else:
             walk.signals[place.name] = walk.static(place, layer)
-    noise_sd = noise_sd if noise_sd.shape[-2] == 1 else held(noise_sd, parts)
-    return replace(walk.finish(noise_sd), substeps=parts)
+    return replace(walk.finish(held(noise_sd, parts)), substeps=parts)

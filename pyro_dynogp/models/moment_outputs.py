@@ -155,13 +155,14 @@ class MomentOutputs(OutputProcess):
             return mean @ joined[b].T, variance
 
         found = each(compiled, len(elements))
-        mean = np.stack([m for m, _ in found])[:, :: self.system.substeps]
-        sd = np.sqrt(np.stack([v for _, v in found]))[:, :: self.system.substeps]
+        parts = self.system.substeps
+        mean = np.stack([m for m, _ in found])[:, ::parts]
+        sd = np.sqrt(np.stack([v for _, v in found])[:, ::parts])
         out, start = {}, 0
         for name, signal in self.assembly.signals.items():
             if name == INPUTS:
                 continue
-            sampled = signal.known[..., :: self.system.substeps, :]
+            sampled = signal.known[..., ::parts, :]
             n, w = sampled.shape[-2:]
             known = sampled.expand(*batch, n, w).reshape(-1, n, w).numpy()
             if signal.rows is None:

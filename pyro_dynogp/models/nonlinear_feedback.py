@@ -10,7 +10,7 @@ from pyro_dynogp.layers.kernels import ROUGH, SMOOTH
 from pyro_dynogp.layers.noise import Gaussian, Likelihood
 from pyro_dynogp.models.arrival import free_delays
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.step import SUBSTEPS, Step
+from pyro_dynogp.models.step import Step, usual_substeps
 from pyro_dynogp.models.structure import ModelOptions
 from pyro_dynogp.models.wiring import Dynamic, Layer, Static
 from pyro_dynogp.support.errors import SWITCH, invalid, verify
@@ -69,7 +69,8 @@ def NonlinearFeedback(
     back: tuple[str, ...] = ("f1", "f2") if hidden else ("f1",) if step else ("f",)
     back = (*back, "step") if step else back
     if substeps is None:
-        substeps = SUBSTEPS if step and not free_delays(options.get("channels", ())) else 1
+        late = bool(free_delays(options.get("channels", ())))
+        substeps = usual_substeps(steps=step, late=late)
     smoothness = SMOOTH if kernel is None else ROUGH
     layers: list[Layer] = [
         Dynamic(

@@ -15,6 +15,11 @@ WIDTH, SPREAD = -2.0, 1.0
 SUBSTEPS = 3
 
 
+def usual_substeps(*, steps: bool, late: bool) -> int:
+    """Parts of each interval where a step is in feedback; one beside free dead times."""
+    return SUBSTEPS if steps and not late else 1
+
+
 def step(x: Tensor, at: Tensor, width: Tensor) -> Tensor:
     """tanh((x - at) / width)."""
     return ((x - at) / width).tanh()

@@ -9,7 +9,7 @@ from pyro_dynogp.data.channels import Channel, count_direct
 from pyro_dynogp.layers.kernels import SMOOTH
 from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.step import SUBSTEPS, Step
+from pyro_dynogp.models.step import Step, usual_substeps
 from pyro_dynogp.models.wiring import (
     HIDDEN,
     INPUTS,
@@ -165,7 +165,7 @@ def with_feedback(model: Model, *, output: bool = True, hidden: bool = False) ->
     for wire, other in zip(model.wires, model.layers, strict=True):
         sees = () if wire.sources == (INPUTS,) and not layers else wire.sources
         if isinstance(other, Dynamic) and wire.name == seen.name:
-            parts = max(layer.substeps, SUBSTEPS if hidden and not model.late else 1)
+            parts = max(layer.substeps, usual_substeps(steps=hidden, late=bool(model.late)))
             other = replace(
                 other, feedback=names, hidden=max(layer.hidden, int(hidden)), substeps=parts
             )

@@ -77,9 +77,10 @@ class Problem:
     def excerpt(self) -> Problem | None:
         """The same of the first part of a long record; None where the whole is needed.
 
-        So it is with several records, and where an input or output hardly moves in that part.
+        So it is with several records, with values that are learnt from another fit, and where an
+        input or output hardly moves in that part.
         """
-        if len(self.records) > 1 or len(self.records[0]) < LONG:
+        if self.learnt is not None or len(self.records) > 1 or len(self.records[0]) < LONG:
             return None
         part = self.records[0].head(EXCERPT)
         few, whole = _variances(part), _variances(self.records[0])

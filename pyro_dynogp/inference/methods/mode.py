@@ -160,7 +160,6 @@ def best_optima(
         ValueError: where no start leads to a point with a density.
     """
     model, learnt = problem.model, problem.learnt
-    excerpt = problem.excerpt if learnt is None else None
     if learnt is not None and run.restarts == 0:
         usual = optimizer_for if model.has_function else optimizer_near
         optimizer = optimizer or usual(model)
@@ -168,12 +167,13 @@ def best_optima(
             start = starting_point(model, problem.records, Plan(None, None, False, run.seed))
         starts: list[Values] = [grown(learnt, start)]
         optima = _near(problem, starts, run, optimizer, steps, "optimum")
-    elif excerpt is not None:
-        optimizer = optimizer or optimizer_for(model)
-        few = _from_all_starts(excerpt, run, optimizer, steps)[:CARRIED]
-        optima = _near(problem, [one.values for one in few], run, optimizer, steps, "whole")
     else:
-        optima = _from_all_starts(problem, run, optimizer or optimizer_for(model), steps)
+        optimizer = optimizer or optimizer_for(model)
+        excerpt = problem.excerpt
+        optima = _from_all_starts(excerpt or problem, run, optimizer, steps)
+        if excerpt is not None:
+            few = [optimum.values for optimum in optima[:CARRIED]]
+            optima = _near(problem, few, run, optimizer, steps, "whole")
     if optima[0].energy >= WALL:
         raise ValueError(
             "fit: no start reached a point where the likelihood can be evaluated. Check the "
