@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from pyro_dynogp.inference.canonical import Canonical
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.methods.base import Method, Problem
 from pyro_dynogp.inference.run import Run
@@ -29,4 +30,5 @@ def train_model(
         restarts=run.restarts,
         steps=run.steps,
     )
-    return method(problem, replace(run, checkpoints=kept))
+    canonical = Canonical.of(problem)
+    return canonical.restored(method(canonical.problem, replace(run, checkpoints=kept)))

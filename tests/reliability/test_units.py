@@ -122,6 +122,19 @@ KINDS = {
         SHORT,
         units=False,
     ),
+    "feedback": Kind(first_bent, lambda: dgp.NonlinearFeedback(2, pairs=1, inducing=5), MODE),
+    "feedback of hidden signals": Kind(
+        first_bent, lambda: dgp.NonlinearFeedback(2, pairs=1, inducing=5, hidden=1), SHORT
+    ),
+    "feedback, two outputs": Kind(
+        bent, lambda: dgp.NonlinearFeedback(2, outputs=2, pairs=1, inducing=5), MODE, outputs=True
+    ),
+    "feedback, draws": Kind(
+        bent,
+        lambda: dgp.NonlinearFeedback(2, outputs=2, pairs=1, inducing=5),
+        {"restarts": 1, "steps": 20, "draws": 20},
+        outputs=True,
+    ),
     "Student's t": Kind(
         first_output,
         lambda: LINEAR(2, pairs=1, likelihood=dgp.StudentT(4.0)),
