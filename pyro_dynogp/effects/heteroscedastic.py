@@ -85,7 +85,7 @@ def heteroscedastic_noise(
         scan,
         {"driver": name},
         f"The noise of {r.output_name!r} depends on {what}: its standard deviation varies "
-        f"by a factor of {high / low:.2g} (5 to 95 % of the samples).",
+        f"by a factor of {high / low:.3g} (5 to 95 % of the samples).",
         binned(r, shown, unit * y, unit * level, axes, bins=20),
         unit * scan.size,
     )

@@ -37,13 +37,15 @@ from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.models.wiring import Static, Wire
 
-# Rounds, iterations of the climb in each, and the gain [nats] with which rounds end.
-ROUNDS, STEPS, SETTLED = 4, 15, 0.1
+# Rounds, iterations of the climb in each, and the gain [nats] with which rounds end. Later ones
+# move the evidence by tenths of a nat and no forecast (RMSE of six plants the same to 1 %).
+ROUNDS, STEPS, SETTLED = 4, 15, 0.5
 # Farthest that a parameter goes in one round, in unconstrained units.
 FARTHEST = 1.5
 SEARCH_STEPS = 60
-# Optima of which the evidence chooses.
-CONSIDERED = 2
+# Optima of which the evidence chooses. One that lags by so many nats after a round is left: later
+# rounds gain up to 10.
+CONSIDERED, BEHIND = 2, 10.0
 
 
 def functions_of(model: Model) -> list[tuple[Wire, Static]]:
@@ -66,11 +68,13 @@ def kernels_by_evidence(
     """
     if not kernel_sites(model):  # functions that are known
         return list(optima)
-    leading = [
-        with_kernels_by_evidence(model, records, one, run, f"kernels-{index}")
-        for index, one in enumerate(optima[:CONSIDERED])
-    ]
-    return [min(leading, key=lambda one: one[1])[0]]
+    best, least = optima[0], np.inf
+    for index, one in enumerate(optima[:CONSIDERED]):
+        key = f"kernels-{index}"
+        found, energy = with_kernels_by_evidence(model, records, one, run, key, enough=least)
+        if energy < least:
+            best, least = found, energy
+    return [best]
 
 
 def with_kernels_by_evidence(
@@ -80,12 +84,14 @@ def with_kernels_by_evidence(
     run: Run,
     key: str,
     rounds: int = ROUNDS,
+    enough: float = np.inf,
 ) -> tuple[Optimum, float]:
     """An optimum with kernels of the highest evidence, and all else at its mode given them.
 
     Args:
         model: collapsed, with functions. records: of it. optimum: to begin at.
         run: how. key: of checkpoints. rounds: most of them.
+        enough: -log density that another optimum has come to.
 
     Returns:
         The optimum, or the given one where no round raises the evidence; and its -log density
@@ -96,7 +102,7 @@ def with_kernels_by_evidence(
     here = _Expansion.at(model, records, optimum.values)
     for number in range(rounds):
         values, gain = here.best()
-        if gain < SETTLED:
+        if gain < SETTLED or (number and here.energy > enough + BEHIND):
             break
         found = maximise(
             model, records, [values], run, optimizer=optimizer, steps=STEPS,

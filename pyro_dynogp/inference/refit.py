@@ -175,10 +175,13 @@ def _held(model: Model) -> tuple[str, ...]:
 
 
 def _settled(problem: Problem, optima: list[Optimum], run: Run) -> list[Optimum]:
-    """Optima with kernels by the evidence, with feedback and but for variants that are compared."""
+    """The best optimum with kernels by the evidence; without feedback, and of variants, all optima.
+
+    Variants are compared at the mode, and others have climbed from the same values.
+    """
     if run.steps or not problem.target.has_feedback:
         return optima
-    return kernels_by_evidence(problem.target, problem.records, optima, run)
+    return kernels_by_evidence(problem.target, problem.records, optima[:1], run)
 
 
 def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:

@@ -9,7 +9,7 @@ from pyro_dynogp.data.channels import Channel, count_direct
 from pyro_dynogp.layers.kernels import SMOOTH
 from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.step import Step, usual_substeps
+from pyro_dynogp.models.step import Step, is_step, usual_substeps
 from pyro_dynogp.models.wiring import (
     HIDDEN,
     INPUTS,
@@ -165,15 +165,23 @@ def with_feedback(model: Model, *, output: bool = True, hidden: bool = False) ->
     for wire, other in zip(model.wires, model.layers, strict=True):
         sees = () if wire.sources == (INPUTS,) and not layers else wire.sources
         if isinstance(other, Dynamic) and wire.name == seen.name:
-            parts = max(layer.substeps, usual_substeps(steps=hidden, late=bool(model.late)))
-            other = replace(
-                other, feedback=names, hidden=max(layer.hidden, int(hidden)), substeps=parts
-            )
+            other = replace(other, feedback=names, hidden=max(layer.hidden, int(hidden)))
         layers.append(replace(other, name=wire.name, sees=sees, skip=()))
         layers += back if wire.name == seen.name else []
     return replace(
         model, layers=tuple(layers), scaling=None, output=model.output_wire.name, integrate="all"
     )
+
+
+def with_usual_substeps(model: Model) -> Model:
+    """The model with feedback computed as often between samples as is usual for what is in it."""
+
+    def finer(_: Wire, layer: Dynamic) -> Dynamic:
+        steps = any(w.name in layer.feedback and is_step(w.layer) for w in model.wires)
+        parts = usual_substeps(steps=steps, late=bool(model.late))
+        return replace(layer, substeps=max(layer.substeps, parts))
+
+    return with_dynamics(model, finer)
 
 
 def with_likelihood(model: Model, likelihood: Likelihood) -> Model:

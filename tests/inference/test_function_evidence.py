@@ -14,6 +14,7 @@ from pyro_dynogp.examples.feedback import simulate_duffing
 from pyro_dynogp.inference import function_evidence
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.function_evidence import (
+    BEHIND,
     SETTLED,
     _Expansion,
     functions_of,
@@ -249,7 +250,7 @@ def test_the_evidence_chooses_among_two_optima(rounds, monkeypatch):
     """The more probable one under its own kernel is not the one with more evidence."""
     problem, joint, found = rounds
 
-    def kept(model, records, one, *_):
+    def kept(model, records, one, *_, **__):
         return one, _Expansion.at(model, records, one.values).energy
 
     monkeypatch.setattr(function_evidence, "with_kernels_by_evidence", kept)
@@ -257,6 +258,32 @@ def test_the_evidence_chooses_among_two_optima(rounds, monkeypatch):
     for optima in ([joint, found], [found, joint], [joint, found, joint]):
         best = kernels_by_evidence(problem.target, problem.records, optima, ALONE)
         assert best == [found]
+
+
+@pytest.mark.parametrize(("lag", "climbs"), [(BEHIND - 0.1, 2), (BEHIND + 0.1, 1)])
+def test_an_optimum_that_stays_behind_is_left(rounds, monkeypatch, lag, climbs):
+    """After a round: the first one gains tens of nats."""
+    problem, _, found = rounds
+    levels = iter([100.0, 90.0, 80.0])
+    count = []
+
+    class Place:
+        def __init__(self, *_):
+            self.energy = next(levels)
+
+        def best(self):
+            return found.values, 2.0 * SETTLED
+
+    def climb(*args, **options):
+        count.append(args)
+        return [found]
+
+    monkeypatch.setattr(_Expansion, "at", Place)
+    monkeypatch.setattr(function_evidence, "maximise", climb)
+    with_kernels_by_evidence(
+        problem.target, problem.records, found, ALONE, "behind", rounds=2, enough=90.0 - lag
+    )
+    assert len(count) == climbs
 
 
 def test_free_runs_of_a_default_fit_keep_to_the_spring():

@@ -10,8 +10,11 @@ import pyro_dynogp as dgp
 from pyro_dynogp.data.channels import Trend
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.optimise.gauss_newton import (
+    FEW,
     FLAT,
+    RIDGE,
     Innovations,
+    Local,
     climb,
     has_innovations,
 )
@@ -160,6 +163,30 @@ def test_a_climb_ends_where_no_gradient_is_left(record):
     # By the exact Hessian there is less than twice the tolerance left.
     left = 0.5 * gradient @ np.linalg.solve(potential.hessian(z), gradient)
     assert abs(left) < 2.0 * FLAT
+
+
+@pytest.mark.parametrize(("functions", "steps"), [(True, FEW + 1), (False, 20)])
+def test_a_climb_with_functions_ends_on_a_ridge(monkeypatch, functions, steps):
+    """Where `FEW` iterations gain less than `RIDGE`, though there is more to gain further on."""
+    innovations, z = prepared("two outputs, records")
+    gains = 0.9 * RIDGE / FEW
+    local = Local(
+        0.0, -np.ones(len(z)), np.eye(len(z)), np.zeros((len(z),) * 2), np.zeros((2, 3)),
+        np.ones(3), np.zeros((2, len(z), 3)),
+    )  # fmt: skip
+    level = [0.0]
+
+    def energies(points):
+        level[0] -= gains
+        return np.full(len(points), level[0])
+
+    monkeypatch.setattr(innovations, "has_functions", functions)
+    monkeypatch.setattr(innovations, "local", lambda z: replace(local, energy=level[0]))
+    monkeypatch.setattr(innovations, "bends", lambda here, z, moves: np.zeros_like(moves))
+    monkeypatch.setattr(innovations, "energies", energies)
+    _, history, message = climb(innovations, z, 20)
+    assert len(history) == steps
+    assert message == ("nothing left to gain" if functions else "all steps used")
 
 
 def test_default_starts_end_at_least_as_high_as_random_ones_by_lbfgs(record):

@@ -5,6 +5,8 @@ from types import SimpleNamespace
 import pytest
 
 import pyro_dynogp as dgp
+from pyro_dynogp.models.step import SUBSTEPS
+from pyro_dynogp.models.variants import with_feedback, with_usual_substeps
 from pyro_dynogp.report import loop
 
 
@@ -15,7 +17,7 @@ from pyro_dynogp.report import loop
 def test_last_fits_have_fresh_starts_too(monkeypatch, model, fresh):
     """From what is learnt alone functions can end where they fit noise, poles at poor optima.
 
-    What is learnt of a model with feedback is first refitted in the units of all data.
+    What is learnt of a model with functions is first refitted in the units of all data.
     """
     given, near = {}, SimpleNamespace()
 
@@ -33,4 +35,31 @@ def test_last_fits_have_fresh_starts_too(monkeypatch, model, fresh):
     user = SimpleNamespace(model=dgp.LinearDynamicGP(1), method="map", n_draws=1)
     loop._final([found], user, "record", 1, False)
     assert given["restarts"] == fresh
-    assert given["start"] is (near if model.has_feedback else found)
+    assert given["start"] is (near if model.has_function else found)
+
+
+def test_a_step_that_was_added_gets_its_substeps(monkeypatch):
+    """The search does without them; what the user gave keeps what it has."""
+    fitted, refitted = [], []
+
+    def fit(model, record, **options):
+        fitted.append(model.substeps)
+        return model
+
+    def refit(found, record, *, model, run):
+        refitted.append(model.substeps)
+        return found
+
+    monkeypatch.setattr(loop, "fit_model", fit)
+    monkeypatch.setattr(loop, "refit", refit)
+    added = with_feedback(dgp.LinearDynamicGP(1), hidden=True)
+    smooth = with_feedback(dgp.LinearDynamicGP(1))
+    assert added.substeps == smooth.substeps == 1
+    user = SimpleNamespace(model=added, method="map", n_draws=1)
+    fits = [SimpleNamespace(model=model, seed=3) for model in (added, added, smooth)]
+    loop._final(fits[:2], user, "record", 1, False)
+    loop._final([fits[0], fits[2]], user, "record", 1, False)
+    assert fitted == [1, SUBSTEPS, 1, 1]
+    assert refitted == [1, 1, 1, 1]
+    wider = with_usual_substeps(dgp.NonlinearFeedback(1, hidden=1, substeps=5))
+    assert wider.substeps == 5
