@@ -10,7 +10,13 @@ import torch
 from scipy.stats import multivariate_normal
 
 from pyro_dynogp.inference.density import Potential
-from pyro_dynogp.inference.methods.normal import AS_GOOD, CLOSE, log_weights, variational
+from pyro_dynogp.inference.methods.normal import (
+    AS_GOOD,
+    CLOSE,
+    best_width,
+    log_weights,
+    variational,
+)
 from pyro_dynogp.inference.methods.svi import Schedule
 from pyro_dynogp.inference.run import Run
 
@@ -75,3 +81,31 @@ def test_log_weights_are_the_divergence_of_a_wrong_normal():
     # Monte Carlo of 1920 draws: four standard errors of the mean, two of the variance.
     assert evidence() - float(many.mean()) == pytest.approx(divergence, abs=0.02)
     assert 0.5 * float(many.var()) == pytest.approx(0.5 * (1.1**2 - 1.0) ** 2, rel=0.15)
+
+
+@pytest.mark.parametrize(("factor", "share"), [(1.0, 1.0), (1.9, 0.5), (3.9, 0.25), (30.0, 0.125)])
+def test_svi_begins_with_the_width_of_the_highest_elbo(factor, share):
+    """A normal that is so many times too wide; of the shares that are tried the nearest."""
+    start = {"w": torch.zeros(2, dtype=torch.float64)}
+    potential = Potential(normal, (Y,), start)
+    centre, root = (torch.as_tensor(x) for x in potential.laplace(start))
+    wide = factor * root
+    torch.testing.assert_close(best_width(potential, centre, wide, 0), share * wide)
+
+
+def test_walls_that_the_curvature_at_the_mode_does_not_show():
+    """x^4 against a flat middle: Laplace's normal is far too wide, and SVI begins narrower."""
+
+    def walls(y):
+        x = pyro.sample("x", dist.Normal(torch.zeros((), dtype=torch.float64), 1.0))
+        pyro.factor("walls", -((20.0 * x) ** 4))
+
+    start = {"x": torch.zeros((), dtype=torch.float64)}
+    potential = Potential(walls, (Y,), start)
+    centre, root = (torch.as_tensor(x) for x in potential.laplace(start))
+    assert float(root) == pytest.approx(1.0, rel=0.01)
+    narrow = best_width(potential, centre, root, 0)
+    before, after = (float(log_weights(potential, centre, r, 1).mean()) for r in (root, narrow))
+    assert after > before + 1e4
+    found = variational(walls, (Y,), start, Run(), Schedule(20, 16))
+    assert found.elbo[0] > before + 1e4

@@ -29,6 +29,8 @@ from pyro_dynogp.layers.sites import Arguments, Program
 # that it is found from, and what is said then.
 CLOSE, WEIGHTS = 0.05, 32
 AS_GOOD = "Laplace's approximation is the posterior to 0.05 nats"
+# Shares of Laplace's standard deviations with which SVI may begin.
+NARROWER = (1.0, 0.5, 0.25, 0.125)
 
 
 class PreconditionedNormal(AutoMultivariateNormal):
@@ -105,6 +107,9 @@ def variational(
     if 0.5 * float(weights.var()) <= CLOSE:
         elbo = np.array([float(weights.mean())])
         return VariationalPosterior(Mixture.normal(potential, centre, root), elbo, AS_GOOD)
+    root = run.checkpoints.piece(
+        f"{key}-root", lambda: {"root": best_width(potential, centre, root, run.seed)}
+    )["root"]
     start = {name: value.detach() for name, value in potential.unpack(centre).items()}
     guide = PreconditionedNormal(model, centre, root, init_loc_fn=init_to_value(values=start))
     return _trained(potential, guide, run, schedule, key)
@@ -131,6 +136,18 @@ def _trained(
             loc, root = posterior.loc, posterior.scale_tril
         fitted = Mixture.normal(potential, loc, root)
     return VariationalPosterior(fitted, trained.elbo, trained.message)
+
+
+def best_width(potential: Potential, centre: Tensor, root: Tensor, seed: int) -> Tensor:
+    """The root (d, d), or a share of it, with which the ELBO is highest.
+
+    Where the density falls faster than its curvature at the mode says, as it does with functions
+    in feedback, draws of Laplace's normal are hundreds of nats too unlikely, and SVI of a few steps
+    does not mend that (gas furnace, hidden signals: ELBO -110 at the whole width, 162 at a fourth).
+    """
+    roots = [share * root for share in NARROWER]
+    levels = [float(log_weights(potential, centre, one, seed).mean()) for one in roots]
+    return roots[int(np.nanargmax(levels))]
 
 
 def log_weights(potential: Potential, centre: Tensor, root: Tensor, seed: int) -> Tensor:
