@@ -174,7 +174,7 @@ def _final(
     nats below, with 1.5 times the error).
     Refits of the search are posterior modes; here the posterior is of the kind that the given fit
     has, and at least that of static functions is wanted. A step in feedback that the search added
-    gets its substeps: to tell whether there is one the search does without, in a third of the time.
+    gets its substeps, which the search does without where they are no better.
     """
 
     def refitted(found: Fit) -> Fit:

@@ -1,6 +1,7 @@
 """Refits of extended models: what they start from, and how far they get."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pyro
@@ -10,6 +11,7 @@ import torch
 import pyro_dynogp as dgp
 from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.data.channels import Recorded
+from pyro_dynogp.discrepancy import trials
 from pyro_dynogp.discrepancy.held_out import held_out_density
 from pyro_dynogp.inference import refit as refits
 from pyro_dynogp.inference.methods.base import Problem
@@ -20,6 +22,7 @@ from pyro_dynogp.inference.starts.extended import extended_starts
 from pyro_dynogp.inference.starts.poles import grown
 from pyro_dynogp.models.variants import (
     with_channel,
+    with_feedback,
     with_input_function,
     with_output_function,
     with_pairs,
@@ -153,3 +156,32 @@ def test_models_without_process_noise_stay_as_they_are():
     ):
         assert without_process_noise(model) == model
     assert not without_process_noise(dgp.LinearDynamicGP(1)).layers[0].process_noise
+
+
+@pytest.mark.parametrize(
+    ("gains", "hidden", "substeps"),
+    [
+        ((0.0, 50.0, 50.0), 1, 3),  # better again with substeps
+        ((0.0, 50.0, 0.1), 1, 1),  # no better with them
+        ((0.0, 0.1, 50.0), 0, 1),  # of the output: no step, and nothing to divide
+    ],
+)
+def test_a_step_has_substeps_where_they_are_better(record, monkeypatch, gains, hidden, substeps):
+    """Each variant and the finer one gain so many nats over those before."""
+    plain = dgp.LinearDynamicGP(1, pairs=1)
+    models = (with_feedback(plain), with_feedback(plain, output=False, hidden=True))
+    made = []
+
+    def again(fit, training, *, model, run):
+        made.append(SimpleNamespace(model=model, level=sum(gains[: len(made) + 1])))
+        return made[-1]
+
+    monkeypatch.setattr(trials, "refit", again)
+    monkeypatch.setattr(trials, "held_out_density", lambda fit, *_: np.full(9, fit.level / 9))
+    monkeypatch.setattr(trials, "certain", lambda gain, settings: gain.sum() > 1.0)
+    fold = np.arange(N) >= TRAINING
+    trial = trials.Trial(models, record, (fold,), None, 0, SETTINGS, compared="held out")
+    best = trials._best_ahead(trial, record[:TRAINING])
+    assert best.model.dynamic[0][1].hidden == hidden
+    assert best.model.substeps == substeps
+    assert len(made) == 2 + hidden
