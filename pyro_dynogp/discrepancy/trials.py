@@ -178,7 +178,7 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
 
     for one in others:
         best, density = better(one)
-    finer = with_usual_substeps(_unscaled(best))
+    finer = with_usual_substeps(_unscaled(best), trial.base.model)
     if finer != _unscaled(best):
         best, _ = better(refit(best, training, model=finer, run=trial.run))
     return best

@@ -173,8 +173,13 @@ def with_feedback(model: Model, *, output: bool = True, hidden: bool = False) ->
     )
 
 
-def with_usual_substeps(model: Model) -> Model:
-    """The model with feedback computed as often between samples as is usual for what is in it."""
+def with_usual_substeps(model: Model, base: Model | None = None) -> Model:
+    """The model with feedback computed as often between samples as is usual for what is in it.
+
+    As it is where it extends a base that has fewer: whoever made that one wants it so.
+    """
+    if base is not None and with_usual_substeps(base) != base:
+        return model
 
     def finer(_: Wire, layer: Dynamic) -> Dynamic:
         steps = any(w.name in layer.feedback and is_step(w.layer) for w in model.wires)

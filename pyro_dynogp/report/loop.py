@@ -182,7 +182,7 @@ def _final(
         run = Run(found.seed, workers=1)
         near = refit(found, record, model=model, run=run) if model.has_function else found
         if found is not fits[0]:
-            model = with_usual_substeps(model)
+            model = with_usual_substeps(model, fits[0].model)
         return fit_model(
             model, record, start=near, restarts=1 if model.has_function else None,
             seed=found.seed, workers=1, progress=False, **_method_of(given, model),

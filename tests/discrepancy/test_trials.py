@@ -180,7 +180,8 @@ def test_a_step_has_substeps_where_they_are_better(record, monkeypatch, gains, h
     monkeypatch.setattr(trials, "held_out_density", lambda fit, *_: np.full(9, fit.level / 9))
     monkeypatch.setattr(trials, "certain", lambda gain, settings: gain.sum() > 1.0)
     fold = np.arange(N) >= TRAINING
-    trial = trials.Trial(models, record, (fold,), None, 0, SETTINGS, compared="held out")
+    base = SimpleNamespace(model=plain)
+    trial = trials.Trial(models, record, (fold,), base, 0, SETTINGS, compared="held out")
     best = trials._best_ahead(trial, record[:TRAINING])
     assert best.model.dynamic[0][1].hidden == hidden
     assert best.model.substeps == substeps

@@ -1,5 +1,6 @@
 """How the last fits of a loop begin."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -56,10 +57,13 @@ def test_a_step_that_was_added_gets_its_substeps(monkeypatch):
     smooth = with_feedback(dgp.LinearDynamicGP(1))
     assert added.substeps == smooth.substeps == 1
     user = SimpleNamespace(model=added, method="map", n_draws=1)
-    fits = [SimpleNamespace(model=model, seed=3) for model in (added, added, smooth)]
-    loop._final(fits[:2], user, "record", 1, False)
-    loop._final([fits[0], fits[2]], user, "record", 1, False)
-    assert fitted == [1, SUBSTEPS, 1, 1]
-    assert refitted == [1, 1, 1, 1]
+    line, fine, coarse, other = (
+        SimpleNamespace(model=model, seed=3) for model in (smooth, added, replace(added), smooth)
+    )
+    loop._final([line, fine], user, "record", 1, False)
+    loop._final([line, other], user, "record", 1, False)
+    loop._final([fine, coarse], user, "record", 1, False)  # whose step was there without any
+    assert fitted == [1, SUBSTEPS, 1, 1, 1, 1]
+    assert refitted == [1] * 6
     wider = with_usual_substeps(dgp.NonlinearFeedback(1, hidden=1, substeps=5))
     assert wider.substeps == 5
