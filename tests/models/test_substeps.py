@@ -14,7 +14,7 @@ from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.models.moment_outputs import quiet_last_steps
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.prepared import PreparedRecord
-from pyro_dynogp.models.variants import with_feedback
+from pyro_dynogp.models.variants import with_feedback, with_usual_substeps
 from tests.models.closed_loops import (
     check_gradient,
     make_record,
@@ -162,7 +162,7 @@ class TestRefused:
 
 
 def test_defaults():
-    """Three parts where a step comes back, one else; what the loop adds likewise."""
+    """Three parts where a step comes back, one else; the loop adds them where they are better."""
 
     def parts(model):
         return model.dynamic[0][1].substeps
@@ -174,8 +174,25 @@ def test_defaults():
     assert parts(dgp.NonlinearFeedback(1, hidden=1, substeps=2)) == 2
     linear = dgp.LinearDynamicGP(1)
     assert parts(with_feedback(linear)) == 1
-    assert parts(with_feedback(linear, hidden=True)) == 3
+    assert parts(with_feedback(linear, hidden=True)) == 1
     assert parts(with_feedback(dgp.NonlinearFeedback(1, substeps=5), hidden=True)) == 5
+
+
+def test_usual_ones():
+    """Those of a step that was added; a base that has fewer than is usual is as it should be."""
+
+    def parts(model, base=None):
+        return with_usual_substeps(model, base).dynamic[0][1].substeps
+
+    added = with_feedback(dgp.LinearDynamicGP(1), hidden=True)
+    assert parts(added) == parts(added, dgp.LinearDynamicGP(1)) == 3
+    assert parts(with_feedback(dgp.LinearDynamicGP(1))) == 1
+    late = dgp.LinearDynamicGP(1, channels=(dgp.Delayed("u"),))
+    assert parts(with_feedback(late, hidden=True)) == 1
+    coarse = dgp.NonlinearFeedback(1, hidden=1, substeps=1)
+    assert parts(coarse) == 3
+    assert parts(coarse, coarse) == 1
+    assert parts(dgp.NonlinearFeedback(1, hidden=1, substeps=5), coarse) == 5
 
 
 def test_files_keep_them(tmp_path):
