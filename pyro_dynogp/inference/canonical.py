@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -104,7 +105,7 @@ class Canonical:
                 value = value.index_select(-axis, places)
         return value
 
-    @property
+    @cached_property
     def _places(self) -> dict[str, Tensor]:
         """By name of a dimension: where each of its entries is in the canonical problem.
 
