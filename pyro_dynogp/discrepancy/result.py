@@ -26,6 +26,7 @@ Decision = Literal["accepted", "tie", "nearly", "rejected", "undecided", "not tr
 Outcome = Decision | Literal["not significant"]
 # The outcome where what was found does harm on the last block.
 KEPT = "effects named, model kept"
+WORSE_WITH = "with it the model does worse on the last block"
 RELY_ON_BEFORE = (
     "with them the model does worse on the last block. Rely on the model before (report.fit), not "
     "on the extended one (report.extended)."
@@ -109,6 +110,9 @@ class FoundEffect:
         block: the model's block, in words. curve: the evidence.
         ties: names of effects that explain the data as well.
         experiment: which experiment would tell them apart, "" without ties.
+        last_block: scores on block C of the model with this effect and those before; empty of what
+            is only reported.
+        kept: whether `LoopResult.fit` has it; False where it does harm on block C.
     """
 
     name: str
@@ -123,6 +127,8 @@ class FoundEffect:
     curve: Curve | None
     ties: tuple[str, ...] = ()
     experiment: str = ""
+    last_block: Mapping[str, float] = field(default_factory=dict)
+    kept: bool = True
 
 
 @shown
@@ -141,8 +147,9 @@ class LoopResult:
         elpd_gain, elpd_gain_error: elpd on C after less before, block standard error [nats].
         fit: the fit to rely on, of A and B: `extended`, but `base` where that does better on C.
         base: the model given, fitted to A and B.
-        extended: the model with all effects that were accepted, fitted to A and B, also where
-            `fit` is the one before; `base` where nothing was added.
+        extended: the model with the effects that were accepted, fitted to A and B, without those at
+            the end that do harm on C; with all of them where `fit` is `base`, which is `extended`
+            where nothing was added.
         attempts: all that was considered. tests: every test of every round, most probable effects
             first. left: what structure is left at the end, in words; empty where none is.
         warnings: sentences for the reader. data: which part was for what.
@@ -222,6 +229,8 @@ class LoopResult:
             lines.append(f"{k}. {one.name}: {one.sentence}")
             lines += [f"   {name}: {mean:.4g} +- {sd:.2g}" for name, (mean, sd) in
                       one.parameters.items()]  # fmt: skip
+            if self.said_of_last_block(one):
+                lines.append(f"   {self.said_of_last_block(one)}")
             if one.ties:
                 lines.append(f"   {one.name} or {', '.join(one.ties)}: {one.experiment}")
         lines.append(self.data)
@@ -234,9 +243,28 @@ class LoopResult:
 
     @property
     def headline(self) -> str:
-        """The outcome as a sentence; where the extended model does harm, which one to rely on."""
+        """The outcome as a sentence; where what was added does harm, which model to rely on."""
         said = f"{self.outcome[:1].upper()}{self.outcome[1:]}"
-        return f"{said}: {RELY_ON_BEFORE}" if self.model_kept else f"{said}."
+        if self.model_kept:
+            return f"{said}: {RELY_ON_BEFORE}"
+        if self.left_out:
+            return f"{said}; {' and '.join(self.left_out)} named, but left out: {WORSE_WITH}."
+        return f"{said}."
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Names of effects that do harm on block C, and that `fit` is without."""
+        return tuple(one.name for one in self.effects if not one.kept)
+
+    def said_of_last_block(self, effect: FoundEffect) -> str:
+        """The error on block C from effect to effect, in words; empty where there is one alone."""
+        added = [one for one in self.effects if one.last_block]
+        if len(added) < 2 or effect not in added:
+            return ""
+        place = added.index(effect)
+        before = added[place - 1].last_block["rmse"] if place else self.before["rmse"]
+        said = f"RMSE on the last block from {before:.3g} to {effect.last_block['rmse']:.3g}"
+        return said if effect.kept or self.model_kept else f"{said}; left out of report.fit"
 
 
 def _plain(one: Any) -> Any:

@@ -42,7 +42,8 @@ class SearchState:
         quiet: whether process noise is taken away until it costs nothing.
         returned: whether rounds began again with it.
         number: of rounds so far.
-        accepted: effects in order. seen: residuals before each of them was added.
+        accepted: effects in order. fits: with each of them and those before. seen: residuals
+            before each was added.
         attempts: what was tried. tests: all tests, whatever came of them.
         reported: what no block mends, by the last tests.
         left: what is left, in words, by the last tests. notes: what else there is to say.
@@ -60,6 +61,7 @@ class SearchState:
     returned: bool = False
     number: int = 0
     accepted: list[tuple[Found, Confirmed]] = field(default_factory=list)
+    fits: list[Fit] = field(default_factory=list)
     seen: list[Sequence[Residuals]] = field(default_factory=list)
     attempts: list[Attempt] = field(default_factory=list)
     tests: list[EffectTest] = field(default_factory=list)
@@ -268,6 +270,7 @@ class SearchState:
         if self.quiet and (noisy := rounds.with_process_noise(fit)) is not None:
             fit, self.quiet = noisy, False
         self._go_on_from(fit)
+        self.fits.append(fit)
         self.watch.stop("refits")
 
     def _go_on_from(self, fit: Fit) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,61 +32,88 @@ if TYPE_CHECKING:
 SCORES = ("rmse", "mae", "nrmse", "crps", "coverage_50", "coverage_95")
 
 
-def report_of(base: Fit, extended: Fit, course: SearchState, warnings: Sequence[str]) -> Report:
+def report_of(fits: Sequence[Fit], course: SearchState, warnings: Sequence[str]) -> Report:
     """Open block C, once.
 
     Args:
-        base, extended: last fits of the model as given and with what was added.
+        fits: last fits of the model as given, with the first effect, with the first two, and so on.
         course: what the rounds came to. warnings: what else is to be known.
     """
     rounds, watch, accepted = course.rounds, course.watch, course.accepted
     data = rounds.data
-    forecasts = [
-        one.forecast(data.known, data.sealed, seed=rounds.seed) for one in (base, extended)
-    ]
-    before, after = ({k: _mean(v) for k, v in scores(f, data.sealed).items() if k in SCORES}
-                     for f in forecasts)  # fmt: skip
+    forecasts = [one.forecast(data.known, data.sealed, seed=rounds.seed) for one in fits]
+    measured = [{k: _mean(v) for k, v in scores(f, data.sealed).items() if k in SCORES}
+                for f in forecasts]  # fmt: skip
     whole = joined(data.known, data.sealed)
     sealed = np.zeros(len(whole), dtype=bool)
     sealed[len(data.known) :] = True
-    densities = [one_step_density(one, whole)[sealed] for one in (base, extended)]
-    there = np.isfinite(densities[0])
-    gain = densities[1][there] - densities[0][there]
-    elpd_gain, elpd_gain_error = float(gain.sum()), block_standard_error(gain)[0]
-    harm: list[str] = []
-    if accepted:
-        compared = Compared(before, after, elpd_gain, elpd_gain_error, rounds.settings)
-        harm = compared.harm
-        warnings = [*compared.disagreement, *warnings]
+    densities = [one_step_density(one, whole)[sealed] for one in fits]
+
+    def compared(after: int, before: int) -> Compared:
+        there = np.isfinite(densities[0])
+        gain = densities[after][there] - densities[before][there]
+        error = block_standard_error(gain)[0]
+        return Compared(measured[before], measured[after], float(gain.sum()), error,
+                        rounds.settings)  # fmt: skip
+
+    count = len(accepted)
+    kept = without_harm(count, compared)
+    # Where nothing is kept the extended model is the one with everything, for comparison.
+    last = kept or count
+    base, extended, change = fits[0], fits[last], compared(last, 0)
+    said: list[str] = []
+    if count and not kept:
+        said = [change.harm]
+    elif kept < count:
+        names = [found.effect.name for found, _ in accepted[kept:]]
+        said = [compared(count, kept).left_out(names)]
     watch.stop("scores of the last block")
     tests = _tested([f for f, _ in accepted], (base, extended), whole, sealed, rounds)
     watch.stop("residual tests of the last block")
-    effects = [_effect(f, c, extended, data.known, rounds.effects) for f, c in accepted]
+    effects = [
+        replace(
+            _effect(found, one, fits[max(k, last)], data.known, rounds.effects),
+            last_block=measured[k], kept=k <= kept,
+        )
+        for k, (found, one) in enumerate(accepted, 1)
+    ]  # fmt: skip
     watch.stop("numbers of the effects")
     return Report(
         effects=(*effects, *(_only_reported(f) for f in course.reported)),
-        outcome=_outcome(course, bool(harm)),
-        before=before,
-        after=after,
-        elpd_gain=elpd_gain,
-        elpd_gain_error=elpd_gain_error,
-        fit=base if harm else extended,
+        outcome=_outcome(course, kept < 1 <= count),
+        before=measured[0],
+        after=measured[last],
+        elpd_gain=change.gain,
+        elpd_gain_error=change.error,
+        fit=fits[kept],
         base=base,
         extended=extended,
         attempts=tuple(course.attempts),
         tests=tuple(course.tests),
         left=course.left,
-        warnings=(*harm, *warnings),
+        warnings=(*said, *(change.disagreement if count else ()), *warnings),
         data=data.sentence,
         last_block_tests=tests,
         sealed=data.sealed,
         known=data.known,
         forecast_before=forecasts[0],
-        forecast_after=forecasts[1],
+        forecast_after=forecasts[last],
         model_before=describe(base.model),
         model_after=describe(extended.model),
         seconds=dict(watch.seconds),
     )
+
+
+def without_harm(count: int, compared: Callable[[int, int], Compared]) -> int:
+    """How many effects, in order, the fit to rely on has: no model before does clearly better.
+
+    Args:
+        count: of all effects. compared: the model with so many effects with that with fewer.
+    """
+    for after in range(count, 0, -1):
+        if not any(compared(after, before).does_harm for before in range(after)):
+            return after
+    return 0
 
 
 @dataclass(frozen=True)
@@ -120,8 +147,8 @@ class Compared:
         return self.gain < -self.settings.worse_errors * self.error
 
     @property
-    def harm(self) -> list[str]:
-        """In words, that the extended model does worse on the last block; nothing where not.
+    def does_harm(self) -> bool:
+        """Whether what was added makes the model do worse on the last block.
 
         It does where the RMSE and the CRPS of its forecasts are more than `settings.worse` times
         those before, or where it loses more log density than `settings.worse_errors` standard
@@ -129,18 +156,34 @@ class Compared:
         where process noise has gone that made up for what was missing.
         """
         worse = self._all(lambda after, before: after > self.settings.worse * before)
-        if not worse and not (self.less_likely and not self.better):
-            return []
+        return worse or (self.less_likely and not self.better)
+
+    @property
+    def _change(self) -> str:
         scores = ", ".join(
             f"{name.upper()} {self.before[name]:.3g} -> {self.after[name]:.3g}"
             for name in ("rmse", "crps")
         )
-        return [
-            f"What was added does harm on the last block ({scores}, elpd {self.gain:+.1f} +- "
-            f"{self.error:.1f} nats): what held-out data support need not last. Rely on the "
-            f"model before, which report.fit is; report.extended is the extended one. Look at its "
-            f"residuals there, and confirm what was named on another record before you use it."
-        ]
+        return f"{scores}, elpd {self.gain:+.1f} +- {self.error:.1f} nats"
+
+    @property
+    def harm(self) -> str:
+        """In words, that all that was added does harm."""
+        return (
+            f"What was added does harm on the last block ({self._change}): what held-out data "
+            f"support need not last. Rely on the model before, which report.fit is; "
+            f"report.extended is the extended one. Look at its residuals there, and confirm what "
+            f"was named on another record before you use it."
+        )
+
+    def left_out(self, names: Sequence[str]) -> str:
+        """In words, that the last effects do harm, and that the fit is without them."""
+        them, said = "it" if len(names) == 1 else "them", " and ".join(names)
+        return (
+            f"{said[:1].upper()}{said[1:]} would do harm on the last block ({self._change}): "
+            f"report.fit and report.extended are the model before {them}. Confirm what was named "
+            f"on another record before you use it."
+        )
 
     @property
     def disagreement(self) -> list[str]:

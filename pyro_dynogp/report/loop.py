@@ -66,8 +66,9 @@ def close_loop(
     leaves least open is kept, and the others are reported as ties, and so is a cause that the
     catalogue lacks, where products of inputs or responses that change with time explain far more.
     Rounds end where nothing is left, or nothing helps. An effect that no block mends (feedback) is
-    among the report's effects, after those that were added. Where the extended model does clearly
-    worse on C, effects are named, and the report's fit is the model before.
+    among the report's effects, after those that were added. C is forecast with each effect and
+    those before it. Where a model does clearly worse there than one before, its last effect is
+    named, and left out of the report's fit.
 
     Args:
         fit: a fit to one record.
@@ -122,12 +123,11 @@ def close_loop(
     channels = ("", *data.known.output_names, *names)
     warnings = [fault.sentence for fault in data.faults if fault.channel in channels]
     warnings += [*course.notes, *course.said_of_hiding(), *course.said_of_time()]
-    fits = [first, course.current] if course.accepted else [first]
-    # The same samples for both, so that they can be compared.
+    # The same samples for all, so that they can be compared.
     known = where_inputs_are_known(data.known, longest_delay(course.model))
-    fitted = _final(fits, fit, known, workers, progress)
+    fitted = _final([first, *course.fits], fit, known, workers, progress)
     watch.stop("last fits")
-    return report_of(fitted[0], fitted[-1], course, warnings)
+    return report_of(fitted, course, warnings)
 
 
 def _given(fit: Fit, data: Blocks, seed: int) -> Fit:

@@ -11,7 +11,7 @@ import pyro_dynogp as dgp
 from pyro_dynogp import LoopSettings, effects
 from pyro_dynogp.discrepancy.result import KEPT
 from pyro_dynogp.report import last_block
-from pyro_dynogp.report.last_block import Compared, _outcome
+from pyro_dynogp.report.last_block import Compared, _outcome, without_harm
 from tests.discrepancy.test_loop import close, fitted, machine
 
 BEFORE = {"rmse": 1.0, "crps": 0.5}
@@ -34,11 +34,15 @@ BEFORE = {"rmse": 1.0, "crps": 0.5}
     ],
 )
 def test_harm_is_said(after: dict[str, float], gain: float, harm: bool) -> None:
-    found = Compared(BEFORE, after, gain, 3.0, LoopSettings()).harm
-    assert bool(found) is harm
-    if harm:
-        assert f"CRPS 0.5 -> {after['crps']:.3g}, elpd {gain:+.1f} +- 3.0 nats" in found[0]
-        assert "Rely on the model before" in found[0]
+    found = Compared(BEFORE, after, gain, 3.0, LoopSettings())
+    assert found.does_harm is harm
+    change = f"CRPS 0.5 -> {after['crps']:.3g}, elpd {gain:+.1f} +- 3.0 nats"
+    assert change in found.harm
+    assert "Rely on the model before" in found.harm
+    assert found.left_out(["drift"]).startswith("Drift would do harm on the last block (RMSE 1")
+    assert change in found.left_out(["drift", "CO2"])
+    assert "the model before it." in found.left_out(["drift"])
+    assert "the model before them." in found.left_out(["drift", "CO2"])
 
 
 @pytest.mark.parametrize(
@@ -56,7 +60,32 @@ def test_scores_that_disagree_are_said(after: dict[str, float], gain: float, sai
 
 
 def test_two_models_that_are_the_same_do_no_harm() -> None:
-    assert Compared(BEFORE, BEFORE, 0.0, 0.0, LoopSettings()).harm == []
+    assert not Compared(BEFORE, BEFORE, 0.0, 0.0, LoopSettings()).does_harm
+
+
+@pytest.mark.parametrize(
+    ("errors", "kept"),
+    [
+        ([1.0], 0),
+        ([1.0, 0.5], 1),
+        ([1.0, 1.06], 0),
+        ([1.0, 0.5, 0.4], 2),
+        ([1.0, 0.5, 0.52], 2),  # within a twentieth
+        ([1.0, 0.5, 0.53], 1),
+        ([1.0, 0.5, 2.0], 1),
+        ([1.0, 2.0, 0.5], 2),  # both together are worth it
+        ([1.0, 1.2, 1.3], 0),
+        ([1.0, 1.2, 1.1], 0),
+        ([1.0, 0.5, 0.7, 0.6], 1),  # better than one before is not enough
+        ([1.0, 0.5, 0.7, 0.4], 3),
+    ],
+)
+def test_the_last_effects_stay_only_where_they_do_no_harm(errors: list[float], kept: int) -> None:
+    def compared(after: int, before: int) -> Compared:
+        scores = [{"rmse": errors[k], "crps": errors[k]} for k in (before, after)]
+        return Compared(*scores, 0.0, 1.0, LoopSettings())
+
+    assert without_harm(len(errors) - 1, compared) == kept
 
 
 @pytest.mark.parametrize(
@@ -78,9 +107,9 @@ def test_outcomes(accepted: bool, left: bool, early: bool, harm: bool, outcome: 
     assert _outcome(course, harm) == outcome
 
 
-def turned() -> dgp.Record:
+def turned(**options: Any) -> dgp.Record:
     """A line in time that turns back where the last block begins."""
-    record = machine(seed=3)
+    record = machine(seed=3, **options)
     path = [min(k, 720 - k) / 240 for k in range(len(record))]
     return record.with_outputs(record.outputs[:, 0] + path)
 
@@ -119,8 +148,40 @@ def test_without_harm_the_extended_model_is_the_fit(monkeypatch: pytest.MonkeyPa
     assert report.outcome == "effects added"
     assert report.fit is report.extended is not report.base
     assert str(report).startswith("Effects added.\n")
-    monkeypatch.setattr(last_block.Compared, "harm", ["Harm."])
+    monkeypatch.setattr(last_block.Compared, "does_harm", True)
     again = close(fitted(record), record)
     assert again.fit is again.base
     assert again.after == report.after  # the numbers stay as measured
     assert again.outcome == KEPT
+
+
+def test_of_two_effects_the_one_that_does_harm_is_left_out(tmp_path: Any) -> None:
+    record = turned(weight=0.6)
+    both = (effects.ExtraInput(), effects.Drift())
+    report = close(fitted(record), record, effects=both, max_rounds=2)
+    first, drift = report.effects
+    assert [first.name, drift.name] == ["extra input", "drift"]
+    assert [first.kept, drift.kept] == [True, False]
+    assert drift.parameters  # of the model that has it
+    assert report.left_out == ("drift",)
+    assert report.fit is report.extended is not report.base
+    assert not report.model_kept
+    assert report.after == first.last_block
+    assert report.after["rmse"] < 0.9 * report.before["rmse"]
+    assert drift.last_block["rmse"] > 1.05 * report.after["rmse"]
+    assert [type(one).__name__ for one in report.fit.model.channels] == ["Recorded"]
+    assert report.headline.endswith(
+        "; drift named, but left out: with it the model does worse on the last block."
+    )
+    assert report.warnings[0].startswith("Drift would do harm on the last block")
+    said = report.said_of_last_block(drift)
+    assert said.endswith("; left out of report.fit")
+    assert f"   {said}" in str(report).splitlines()
+    assert "left out" not in report.said_of_last_block(first)
+    report.to_html(tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    headline = page.partition("<h1>")[2].partition("</h1>")[0]
+    assert headline.startswith("One effect was missing from the model and added: extra in")
+    assert "drift named too, but left out" in headline
+    assert said in page
+    assert report.to_dict()["effects"][1]["kept"] is False

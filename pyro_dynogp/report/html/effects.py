@@ -43,7 +43,7 @@ def effects(report: LoopResult) -> str:
 
 
 def _effect(report: LoopResult, k: int, effect: FoundEffect) -> str:
-    size = _size(report, effect)
+    size, said = _size(report, effect), report.said_of_last_block(effect)
     facts = [
         ("Size (root mean square)", measure(size, output_unit(report))) if size else None,
         ("Probability of as much without the effect (p-value)", probability(effect.p_value)),
@@ -53,6 +53,7 @@ def _effect(report: LoopResult, k: int, effect: FoundEffect) -> str:
             plus_minus(effect.gain, effect.gain_error, "nats"),
         ),
         ("Block of the model", effect.block) if effect.block else None,
+        ("With this effect and those before", said) if said else None,
     ]
     facts += [(name, plus_minus(*pair)) for name, pair in effect.parameters.items()]
     rows = "".join(

@@ -85,11 +85,12 @@ def page(report: LoopResult) -> str:
 
 def _headline(report: LoopResult) -> str:
     """The outcome in one sentence."""
-    count, left = len(report.effects), "structure left" in report.outcome
+    kept = [one for one in report.effects if one.kept or report.model_kept]
+    count, left = len(kept), "structure left" in report.outcome
     if count:
         how_many = _NUMBERS[count] if count < len(_NUMBERS) else str(count)
         verb = "effect was" if count == 1 else "effects were"
-        names = listed([one.name for one in report.effects])
+        names = listed([one.name for one in kept])
         if report.model_kept:
             added = "it" if count == 1 else "them"
             return (
@@ -97,6 +98,11 @@ def _headline(report: LoopResult) -> str:
                 f"{added} on the sealed data: {names}."
             )
         words = f"{how_many} {verb} missing from the model and added: {names}"
+        if report.left_out and not report.model_kept:
+            words += (
+                f"; {listed(list(report.left_out))} named too, but left out, as the model does "
+                "worse with that on the sealed data"
+            )
         if "ended early" in report.outcome:
             return f"{words}; the search ended early."
         return f"{words}; structure of unknown cause is left." if left else f"{words}."
