@@ -91,14 +91,15 @@ def confirm(
     winner = better[_chosen(better, playing, equal, level)]
     name = winner.found.effect.name
     names = dict.fromkeys(better[k].found.effect.name for k in equal)
+    tried = refits.with_substeps(winner)
     decided = [_decided(one, winner, any(one is better[k] for k in equal), name) for one in judged]
     return Confirmed(
         attempts=(*decided, *untried),
         winner=winner.found,
         before=refits.model,
-        model=winner.tried.model,
+        model=tried.model,
         attempt=next(a for a in decided if a.decision == "accepted"),
-        fit=winner.tried.fit if winner.kind[0] == "after" else None,
+        fit=tried.fit if winner.kind[0] == "after" else None,
         ties=tuple(one for one in names if one != name),
     )
 

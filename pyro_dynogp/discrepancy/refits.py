@@ -14,7 +14,7 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.held_out import interleaved
 from pyro_dynogp.discrepancy.judged import Judged, Kind, judge, kind_of
 from pyro_dynogp.discrepancy.search import Candidate, Found
-from pyro_dynogp.discrepancy.trials import Trial, Tried, run
+from pyro_dynogp.discrepancy.trials import Trial, Tried, run, with_substeps
 from pyro_dynogp.fitting import Fit
 from pyro_dynogp.models.variants import Model
 from pyro_dynogp.statistics.settings import LoopSettings
@@ -99,6 +99,12 @@ class Refits:
         """One candidate against the model without it."""
         base = self.results["", kind]
         return judge(found, kind, tried, base, self.number, self.settings)
+
+    def with_substeps(self, one: Judged) -> Tried:
+        """What was kept of a candidate, with substeps where they are better and time is left."""
+        if self.late is not None and self.late():
+            return one.tried
+        return with_substeps(self.trial((one.tried.model,), one.kind, one.found), one.tried)
 
     def on_one_scale(self, better: Sequence[Judged]) -> list[Judged]:
         """The same candidates scored alike, since gains on different densities do not compare."""

@@ -160,9 +160,6 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
     Where they differ in how they extrapolate what is right in one stretch may be luck: of those
     that are rehearsed only those count whose forecasts are no worse than those of the base held at
     its last level, or else the last one, which leaves most open.
-
-    A step in feedback takes three times as long with its substeps: it gets them, and keeps them in
-    the rounds to come, only where that is certainly better, too.
     """
     fits = [refit(trial.base, training, model=model, run=trial.run) for model in trial.models]
     fold, settings = trial.folds[0], trial.settings
@@ -171,17 +168,26 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
         kept = lasting(fits, trial.base, trial.record, fold, trial.run, settings) or fits[-1:]
     best, *others = kept
     density = held_out_density(best, trial.record, fold, trial.score)
-
-    def better(one: Fit) -> tuple[Fit, np.ndarray]:
-        own = held_out_density(one, trial.record, fold, trial.score)
-        return (one, own) if certain(own - density, settings) else (best, density)
-
     for one in others:
-        best, density = better(one)
-    finer = with_usual_substeps(_unscaled(best), trial.base.model)
-    if finer != _unscaled(best):
-        best, _ = better(refit(best, training, model=finer, run=trial.run))
+        own = held_out_density(one, trial.record, fold, trial.score)
+        if certain(own - density, settings):
+            best, density = one, own
     return best
+
+
+def with_substeps(trial: Trial, tried: Tried) -> Tried:
+    """What was kept, with the usual substeps of a step in feedback where they are certainly better.
+
+    A step takes three times as long with its substeps: what is added gets them, and keeps them in
+    the rounds to come, only where they pay.
+    """
+    finer = with_usual_substeps(tried.model, trial.base.model)
+    if tried.fit is None or finer == tried.model:
+        return tried
+    found = run(replace(trial, models=(finer,), base=tried.fit, fit=None))
+    if found.failure or not certain(found.densities - tried.densities, trial.settings):
+        return tried
+    return found
 
 
 def _unscaled(fit: Fit) -> Model:

@@ -33,7 +33,7 @@ from pyro_dynogp.inference.starts.plans import starting_points
 from pyro_dynogp.inference.starts.poles import grown
 from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.variants import without_noise_below_functions
+from pyro_dynogp.models.variants import differ_in_substeps, without_noise_below_functions
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import seeded
@@ -225,6 +225,8 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
         return _settled(problem, optima, run)
     if run.steps:  # a few, to compare variants
         starts = [most_probable(problem, starts)]
+    if differ_in_substeps(target, fit.model):  # nothing is new
+        return _settled(problem, climbed(target, starts[:1], LAYERED_STEPS), run)
     quiet = without_noise_below_functions(target)
     if quiet != target:
         best = climbed(quiet, [louder(start) for start in starts], LAYERED_STEPS)[0]

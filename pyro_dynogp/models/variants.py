@@ -189,6 +189,15 @@ def with_usual_substeps(model: Model, base: Model | None = None) -> Model:
     return with_dynamics(model, finer)
 
 
+def differ_in_substeps(model: Model, other: Model) -> bool:
+    """Whether two models, in whatever units, differ in how often they compute feedback alone."""
+    one, two = (
+        with_dynamics(replace(m, scaling=None), lambda _, layer: replace(layer, substeps=1))
+        for m in (model, other)
+    )
+    return one == two and model.substeps != other.substeps
+
+
 def with_likelihood(model: Model, likelihood: Likelihood) -> Model:
     """The model with other measurement noise."""
     return replace(model, likelihood=likelihood, scaling=None)

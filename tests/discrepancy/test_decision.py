@@ -14,6 +14,7 @@ import pyro_dynogp as dgp
 from pyro_dynogp import effects
 from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.data.channels import Calendar, Delayed, ShiftedClock
+from pyro_dynogp.discrepancy import refits
 from pyro_dynogp.discrepancy.blocks import shared
 from pyro_dynogp.discrepancy.decision import _first_in_line, _specific, _too_special, confirm
 from pyro_dynogp.discrepancy.held_out import interleaved, stretches
@@ -378,3 +379,37 @@ def test_feedback_is_among_the_effects_and_changes_nothing() -> None:
     assert [one.name for one in report.effects] == ["feedback"]
     assert report.before == report.after
     assert "feedback" in str(report)
+
+
+@pytest.mark.parametrize("over", [False, True])
+def test_substeps_are_tried_of_the_winner_alone(
+    monkeypatch: pytest.MonkeyPatch, over: bool
+) -> None:
+    """The rounds to come have what that comes to. Where time is over it is not tried."""
+    record = machine(weight=0.3)
+    fit = fitted(record)
+    both = [
+        spoken_for(effects.ExtraInput(), p, 10.0 * p, channel=name, form="linear", delay=0.0)
+        for name, p in (("wind", 0.01), ("heat", 1e-9))
+    ]
+    plain = replace(fit.model, scaling=None)
+    tasks = [(one, tuple(one.effect.extend(plain, one.evidence, record))) for one in both]
+    divided = Tried(replace(plain), np.zeros(1), 1.0, fit=fit)
+    asked: list[Any] = []
+
+    def with_substeps(trial: Any, one: Tried) -> Tried:
+        assert trial.models == (one.model,)
+        assert trial.folds[0].sum() == 120
+        asked.append(one.model)
+        return divided
+
+    monkeypatch.setattr(refits, "with_substeps", with_substeps)
+    looks = iter([False, True])
+    done = confirm(
+        tasks, fit, record[:360], np.arange(360) >= 240, number=1, seed=0, level=0.05,
+        settings=SETTINGS, workers=4, late=(lambda: next(looks)) if over else None,
+    )  # fmt: skip
+    assert done.winner is both[1]
+    assert len(asked) == (0 if over else 1)
+    assert (done.model is divided.model) is not over
+    assert (done.fit is fit) is not over

@@ -1,6 +1,6 @@
 """Refits of extended models: what they start from, and how far they get."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -32,6 +32,14 @@ from tests.discrepancy.made import SETTINGS, coloured, fitted_mode
 from tests.discrepancy.plant_dynamics import System, response
 
 NOISE, N, TRAINING = 0.05, 320, 220
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """A fit of which only the model and its density of held-out data are asked for."""
+
+    model: dgp.LinearDynamicGP
+    level: float
 
 
 @pytest.fixture(scope="module")
@@ -167,22 +175,51 @@ def test_models_without_process_noise_stay_as_they_are():
     ],
 )
 def test_a_step_has_substeps_where_they_are_better(record, monkeypatch, gains, hidden, substeps):
-    """Each variant and the finer one gain so many nats over those before."""
+    """Each variant and the finer one gain so many nats over those before.
+
+    The finer one is refitted from what is kept, once it is to be added.
+    """
     plain = dgp.LinearDynamicGP(1, pairs=1)
     models = (with_feedback(plain), with_feedback(plain, output=False, hidden=True))
-    made = []
+    made, began = [], []
 
     def again(fit, training, *, model, run):
-        made.append(SimpleNamespace(model=model, level=sum(gains[: len(made) + 1])))
+        made.append(Made(model, sum(gains[: len(made) + 1])))
+        began.append(fit)
         return made[-1]
 
+    def density(fit, *_):
+        return np.full(9, fit.level / 9)
+
     monkeypatch.setattr(trials, "refit", again)
-    monkeypatch.setattr(trials, "held_out_density", lambda fit, *_: np.full(9, fit.level / 9))
+    monkeypatch.setattr(trials, "held_out_density", density)
+    monkeypatch.setattr(trials, "scored", lambda fit, *_: (density(fit), np.zeros((9, 1))))
     monkeypatch.setattr(trials, "certain", lambda gain, settings: gain.sum() > 1.0)
     fold = np.arange(N) >= TRAINING
     base = SimpleNamespace(model=plain)
     trial = trials.Trial(models, record, (fold,), base, 0, SETTINGS, compared="held out")
-    best = trials._best_ahead(trial, record[:TRAINING])
-    assert best.model.dynamic[0][1].hidden == hidden
-    assert best.model.substeps == substeps
+    tried = trials.run(trial)
+    assert tried.model.dynamic[0][1].hidden == hidden
+    assert tried.model.substeps == 1
+    assert len(made) == 2
+    finer = trials.with_substeps(trial, tried)
+    assert finer.model.dynamic[0][1].hidden == hidden
+    assert finer.model.substeps == substeps
+    assert (finer is tried) == (substeps == 1)
     assert len(made) == 2 + hidden
+    assert began[:2] == [base, base]
+    assert began[2:] == [tried.fit] * hidden
+
+
+def test_substeps_that_cannot_be_fitted_are_left(record, monkeypatch):
+    model = with_feedback(dgp.LinearDynamicGP(1, pairs=1), output=False, hidden=True)
+    fold = np.arange(N) >= TRAINING
+    base = Made(dgp.LinearDynamicGP(1, pairs=1), 0.0)
+    tried = trials.Tried(model, np.zeros(9), 1.0, fit=Made(model, 0.0))
+    trial = trials.Trial((model,), record, (fold,), base, 0, SETTINGS)
+
+    def refused(*_, **__):
+        raise ValueError("fit: no start reached a point.")
+
+    monkeypatch.setattr(trials, "refit", refused)
+    assert trials.with_substeps(trial, tried) is tried

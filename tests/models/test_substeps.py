@@ -8,13 +8,16 @@ import pytest
 import torch
 
 import pyro_dynogp as dgp
+from pyro_dynogp.inference import refit as refits
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.free_runs import free_run_error
+from pyro_dynogp.inference.optimise.maximum import maximise
+from pyro_dynogp.inference.run import Run
 from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.models.moment_outputs import quiet_last_steps
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.prepared import PreparedRecord
-from pyro_dynogp.models.variants import with_feedback, with_usual_substeps
+from pyro_dynogp.models.variants import differ_in_substeps, with_feedback, with_usual_substeps
 from tests.models.closed_loops import (
     check_gradient,
     make_record,
@@ -193,6 +196,39 @@ def test_usual_ones():
     assert parts(coarse) == 3
     assert parts(coarse, coarse) == 1
     assert parts(dgp.NonlinearFeedback(1, hidden=1, substeps=5), coarse) == 5
+
+
+def test_models_that_differ_in_them_alone():
+    one = dgp.NonlinearFeedback(1, hidden=1)
+    two = dgp.NonlinearFeedback(1, hidden=1, substeps=1)
+    assert differ_in_substeps(one, two)
+    scaled = replace(two, scaling=dgp.Scaling.from_records(make_record(n=60, missing=False)))
+    assert differ_in_substeps(one, scaled)
+    assert not differ_in_substeps(two, scaled)
+    assert not differ_in_substeps(one, one)
+    assert not differ_in_substeps(one, dgp.NonlinearFeedback(1, hidden=1, substeps=1, inducing=4))
+    assert not differ_in_substeps(one, dgp.NonlinearFeedback(1))
+
+
+def test_a_refit_with_others_begins_at_what_is_learnt_and_nowhere_else(monkeypatch):
+    record = make_record(n=60, missing=False)
+    model = dgp.NonlinearFeedback(1, hidden=1, substeps=1, inducing=4)
+    quick = {"method": "map", "restarts": 1, "steps": 2, "workers": 1, "progress": False}
+    fit = dgp.fit(model, record, **quick)
+    climbs = []
+
+    def climb(target, records, starts, run, **options):
+        climbs.append((target.substeps, starts))
+        return maximise(target, records, starts, run, **options)
+
+    monkeypatch.setattr(refits, "maximise", climb)
+    run = Run(0, workers=1, steps=2)
+    other = dgp.NonlinearFeedback(1, hidden=1, substeps=3, inducing=4)
+    finer = refits.refit(fit, record, model=other, run=run)
+    ((parts, (start,)),) = climbs
+    assert parts == finer.model.substeps == 3
+    for name, value in fit.mode.items():
+        torch.testing.assert_close(start[name], value, rtol=0, atol=1e-12)
 
 
 def test_files_keep_them(tmp_path):
