@@ -98,6 +98,18 @@ def rated(found: Sequence[tuple[Effect, Evidence]]) -> list[Found]:
     return sorted(both, key=lambda f: (f.evidence.p_value, -f.evidence.gain))
 
 
+def extended_by(found: Found, model: Model, record: Record) -> tuple[Sequence[Model], str]:
+    """Variants of the model with an effect, and why there are none, in words.
+
+    Not every model can be extended by every effect: nothing can be made from an input whose dead
+    time is a parameter.
+    """
+    try:
+        return found.effect.extend(model, found.evidence, record), ""
+    except ValueError as error:
+        return (), f"the model cannot have it: {str(error).partition('. ')[0].rstrip('.')}"
+
+
 def candidates_of(
     found: Sequence[Found],
     model: Model,
@@ -123,7 +135,7 @@ def candidates_of(
         if (p > level and not relative) or len(out) >= tries:
             continue
         known = made.setdefault(one.effect.name, set())
-        extended = one.effect.extend(model, one.evidence, record)
+        extended, _ = extended_by(one, model, record)
         variants = tuple(variant for variant in extended if repr(variant) not in known)
         if variants:
             out.append((one, variants))

@@ -11,7 +11,7 @@ from pyro_dynogp.discrepancy.context import SearchContext, Stopwatch, Tested
 from pyro_dynogp.discrepancy.data_faults import data_spikes
 from pyro_dynogp.discrepancy.decision import LATE, Confirmed
 from pyro_dynogp.discrepancy.result import Attempt, EffectTest, Outcome
-from pyro_dynogp.discrepancy.search import Candidate, Found, candidates_of
+from pyro_dynogp.discrepancy.search import Candidate, Found, candidates_of, extended_by
 from pyro_dynogp.effects.base import OUTSIDE
 from pyro_dynogp.models.variants import Model, has_process_noise
 from pyro_dynogp.statistics.evidence import Residuals
@@ -246,7 +246,8 @@ class SearchState:
         for f in found:
             if f.q_value > self.rounds.level or any(f is one for one in tried):
                 continue
-            attempt = Attempt(self.number, f.evidence, f.q_value, "not tried", why)
+            refused = extended_by(f, self.model, self.rounds.data.known)[1]
+            attempt = Attempt(self.number, f.evidence, f.q_value, "not tried", refused or why)
             if not f.effect.added:
                 attempt = replace(attempt, decision="reported", reason="is reported, not added")
             elif self._is_fed_back(f):

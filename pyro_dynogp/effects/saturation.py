@@ -60,7 +60,7 @@ def saturation(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -
     else:
         noticed = p < settings.noticed
         low, high, slope = _flat_limits(r, knots[scan.best], noticed, settings)
-        p = 1.0 if noticed and slope > settings.flat else p
+        p = 1.0 if (noticed and slope > settings.flat) or low >= high else p
         how = ""
     limits = [f"{at:.4g}{unit(r.output_unit)}" for at in (low, high) if np.isfinite(at)]
     label = labelled(r.output_name, r.output_unit)

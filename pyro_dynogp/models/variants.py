@@ -121,10 +121,15 @@ def with_output_function(model: Model, limits: Limits | None = None) -> Model | 
 def with_input_function(model: Model) -> Model | None:
     """The model with a static layer before its first dynamic one.
 
-    None where there is one already, or feedback.
+    None where there is one already, or feedback, or layers name what they see.
     """
     driving = model.inputs - model.direct
-    if isinstance(model.layers[0], StaticLayer) or model.has_feedback or not driving:
+    if (
+        any(layer.sees for layer in model.layers)
+        or isinstance(model.layers[0], StaticLayer)
+        or model.has_feedback
+        or not driving
+    ):
         return None
     first = Static(outputs=driving, inducing=INDUCING)
     return replace(model, layers=(first, *model.layers), scaling=None, output=None)

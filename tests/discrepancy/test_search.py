@@ -11,11 +11,13 @@ from scipy import stats
 
 import pyro_dynogp as dgp
 from pyro_dynogp import effects
+from pyro_dynogp.data.channels import DeadZone
 from pyro_dynogp.discrepancy.context import SearchContext
 from pyro_dynogp.discrepancy.held_out import certain, without
-from pyro_dynogp.discrepancy.search import Found, candidates_of, look, rated
+from pyro_dynogp.discrepancy.search import Found, candidates_of, extended_by, look, rated
 from pyro_dynogp.discrepancy.state import SearchState
 from pyro_dynogp.effects import Effect
+from pyro_dynogp.models.variants import with_channel
 from pyro_dynogp.statistics import omnibus
 from pyro_dynogp.statistics.evidence import Evidence
 from pyro_dynogp.statistics.settings import LoopSettings
@@ -241,3 +243,29 @@ def test_the_last_fits_have_the_kind_of_posterior_that_was_given(method):
     for last in (report.base, report.fit):
         assert last.method == method
         assert len(last.draws["noise_sd"]) == len(fit.draws["noise_sd"])
+
+
+def test_an_effect_that_the_model_cannot_have_is_no_candidate_and_says_why():
+    record = machine()
+    model = dgp.LinearDynamicGP(1, pairs=1, channels=(dgp.Delayed("u"),))
+
+    class Made(Certain):
+        def extend(self, model, evidence, record):
+            return [with_channel(model, DeadZone("u delayed", -0.1, 0.1))]
+
+    refused = Found(*speaking(Made("dead zone", 1e-6), 1e-6), 1e-6)
+    fine = Found(*speaking(Certain("drift", 1e-3), 1e-3), 1e-3)
+    chosen = candidates_of([refused, fine], model, record, 0.05, 8, SETTINGS)
+    assert [one.effect.name for one, _ in chosen] == ["drift"]
+    variants, why = extended_by(refused, model, record)
+    assert len(variants) == 0
+    assert why.startswith("the model cannot have it: channels: expected no channel that is made")
+    assert extended_by(fine, model, record) == ([model], "")
+    data = SimpleNamespace(known=record)
+    course = SimpleNamespace(
+        number=2, model=model, rounds=SimpleNamespace(level=0.05, data=data),
+        _is_fed_back=lambda found: False,
+    )  # fmt: skip
+    attempts = SearchState._untried(course, [refused, fine], [], "others come first")
+    assert [one.reason for one in attempts] == [why, "others come first"]
+    assert [one.decision for one in attempts] == ["not tried", "not tried"]

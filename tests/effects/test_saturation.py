@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from pyro_dynogp.effects import saturation as module
 from pyro_dynogp.effects.output_nonlinearity import output_nonlinearity
 from pyro_dynogp.effects.saturation import saturation, ties_at_the_top
 from tests.discrepancy.made import SETTINGS, coloured, lag, residuals_of
@@ -48,3 +49,13 @@ def test_ties_of_a_record_of_few_digits_are_no_limit():
         if (y > 0.6).sum() > 40:
             assert ties_at_the_top(clipped, mean, SETTINGS).p_value < 0.01
     assert rejected <= 6
+
+
+@pytest.mark.parametrize(("low", "high", "there"), [(-0.5, 0.5, True), (0.9, 0.8, False)])
+def test_limits_that_cross_are_none(monkeypatch, low, high, there):
+    monkeypatch.setattr(module, "_flat_limits", lambda *_: (low, high, 0.1))
+    u, a, b, e = two_paths(6)
+    mean = a + b
+    found = saturation(residuals_of(np.clip(mean, -0.5, 0.5) + e, mean, u), SETTINGS)
+    assert found.where == {"low": low, "high": high}
+    assert (found.p_value < 0.01) is there

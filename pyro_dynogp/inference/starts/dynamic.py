@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from torch.nn.functional import pad
 from pyro_dynogp.data.scaling import Scaling, TimeScale
 from pyro_dynogp.inference.starts.poles import WALKS, random_poles
 from pyro_dynogp.layers.functions import in_place
+from pyro_dynogp.models.arrival import columns_of
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.models.wiring import Dynamic, Known, Wire
@@ -23,6 +24,14 @@ SMALL = 0.05
 INTEGRATORS = ("integrator_gain", "integrator_drift", "integrator_noise")
 # Standard deviation of the logarithms by which poles are moved for a layer beside another.
 MOVED = 0.5
+
+
+def with_late_inputs(direct: Tensor, count: int, late: Sequence[int]) -> Tensor:
+    """Direct paths (..., count), none from late inputs, where those of the others are given."""
+    if direct.shape[-1] == count:
+        return direct
+    prompt = torch.tensor([column for column in range(count) if column not in late])
+    return direct.new_zeros(*direct.shape[:-1], count).index_copy(-1, prompt, direct)
 
 
 class DynamicStart:
@@ -83,6 +92,10 @@ class DynamicStart:
             values[self._key(name)] = values[self._key(name)] + self._random(
                 layer.pairs, scale=MOVED
             )
+        shape = self._direct_shape()
+        if self._key("feedthrough") in values and shape is not None:
+            D = values[self._key("feedthrough")]
+            values[self._key("feedthrough")] = with_late_inputs(D, shape[-1], self._late)
         if self.one.fed:
             none = torch.zeros(layer.pairs, 0, 2, dtype=torch.float64)
             gain = values.get(self._key("input_gain"), none)
@@ -90,26 +103,10 @@ class DynamicStart:
             if self._key("integrator_gain") in values:
                 level = values[self._key("integrator_gain")]
                 values[self._key("integrator_gain")] = pad(level, (0, self.one.fed))
-        if layer.width > 1 and self._key("output_gain") not in values:
-            # One signal is the linear fit; the others see the same modes with other gains.
-            P = layer.pairs
-            gain = self._random(layer.width, P, 2, scale=0.7)
-            gain[0] = torch.tensor([1.0, 0.0], dtype=torch.float64)
-            if layer.hidden:
-                gain[-layer.hidden :] = self._hidden(values, ahead)
-            values[self._key("output_gain")] = gain
-            length = gain.square().sum((0, -1)).sqrt()  # directions have unit length
-            values[self._key("input_gain")] = (
-                values[self._key("input_gain")] * length[:, None, None]
-            )
-            if self._key("feedthrough") in values:
-                D = values[self._key("feedthrough")]
-                rest = self._random(layer.width - 1, D.shape[-1], scale=0.1)
-                values[self._key("feedthrough")] = torch.cat([D.reshape(1, -1), rest])
-            for site in map(self._key, INTEGRATORS):
-                if site in values:
-                    rest = self._random(layer.width - 1, *values[site].shape[1:])
-                    values[site] = torch.cat([values[site], rest])
+        none = torch.zeros(0, layer.pairs, 2, dtype=torch.float64)
+        known = len(values.get(self._key("output_gain"), none)) or 1
+        if layer.width > known:
+            values.update(self._more_signals(values, known, ahead))
             if layer.process_noise:
                 values.update(self._small_noise())
         if layer.process_noise and self._key("noise_gain_unit") not in values:
@@ -119,16 +116,52 @@ class DynamicStart:
             values = {k: v for k, v in values.items() if not any(part in k for part in noise)}
         return values
 
-    def _hidden(self, values: Values, ahead: bool) -> Tensor:
-        """Gains (P, 2) of the output's derivative by time, over the middle of the poles' sizes.
+    @property
+    def _late(self) -> tuple[int, ...]:
+        return columns_of(self.model.late, self.scaling)
+
+    def _more_signals(self, values: Values, known: int, ahead: bool) -> Values:
+        """Sites of the layer's signals where the first ones are known: all see the same modes.
+
+        Those that are not hidden see them with other gains, at random.
+        """
+        layer, P = self.layer, self.layer.pairs
+        own = torch.tensor([1.0, 0.0], dtype=torch.float64).expand(1, P, 2)
+        if self._key("output_gain") in values:  # as a direction
+            own = values[self._key("output_gain")]
+            own = own / own.square().sum((0, -1), keepdim=True).sqrt()
+        rest = layer.width - known
+        gain = torch.cat([own, self._random(layer.width, P, 2, scale=0.7)[known:]])
+        if layer.hidden:
+            measured = own[self._signals[0] if known > 1 else 0]
+            gain[-layer.hidden :] = self._hidden(values, measured, ahead)
+        length = gain.square().sum((0, -1)).sqrt()  # directions have unit length
+        found = {
+            self._key("output_gain"): gain,
+            self._key("input_gain"): values[self._key("input_gain")] * length[:, None, None],
+        }
+        if self._key("feedthrough") in values:
+            D = values[self._key("feedthrough")]
+            more = self._random(rest, D.shape[-1], scale=0.1)
+            found[self._key("feedthrough")] = torch.cat([D.reshape(known, -1), more])
+        for site in map(self._key, INTEGRATORS):
+            if site in values:
+                found[site] = torch.cat([values[site], self._random(rest, *values[site].shape[1:])])
+        return found
+
+    def _hidden(self, values: Values, measured: Tensor, ahead: bool) -> Tensor:
+        """Gains (P, 2) of an output's derivative by time, over the middle of the poles' sizes.
 
         That is a velocity where a position is measured. `ahead`: with the output itself added, the
         signal is that of a first-order lag before: a level in the tank above.
+
+        Args:
+            measured: (P, 2), gains of the output: real and imaginary part.
         """
         decay, frequency = (values[self._key(x)].exp() for x in ("log_decay", "log_frequency"))
-        pole = torch.stack([-decay, frequency], -1)
-        derivative = pole / pole.norm(dim=-1).median()
-        return derivative + torch.tensor([float(ahead), 0.0], dtype=torch.float64)
+        pole = torch.complex(-decay, frequency)
+        share = pole / pole.abs().median() + float(ahead)
+        return torch.view_as_real(share * torch.view_as_complex(measured.contiguous()))
 
     def _fed_back(self, gain: Tensor) -> Tensor:
         """Gains (P, d + fed, 2): what comes back acts somewhat as the inputs do, sign at random.
@@ -182,6 +215,9 @@ class DynamicStart:
             values[self._key("output_gain")] = in_place(gain.movedim(0, -1), self._signals).movedim(
                 -1, 0
             )
+        for site in self.model.sites(self.scaling):  # levels stay where they begin
+            if site.name in map(self._key, INTEGRATORS):
+                values[site.name] = torch.zeros(site.shape, dtype=torch.float64)
         if layer.process_noise:
             values.update(self._small_noise())
         return values

@@ -8,10 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.starts.delays import with_delays
 from pyro_dynogp.inference.starts.dynamic import Values
 from pyro_dynogp.inference.starts.linear import leading_layers, linear_twin, one_output
 from pyro_dynogp.inference.starts.plans import Plan, starting_point
 from pyro_dynogp.inference.starts.poles import grown, random_poles, values_given_poles
+from pyro_dynogp.models.arrival import DELAY
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.models.wiring import Dynamic, Static
@@ -41,11 +43,15 @@ def extended_starts(
     learnt = {_renamed(site, places): value for site, value in base.mode.items()}
     sites = model.all_sites(scaling, len(records))
     dynamic = base.system_at(base.mode).dynamic
-    old = {places.get(wire.name): layer.modes.poles.numpy() for wire, layer in dynamic}
+    pairs = {wire.name: layer.pairs for wire, layer in base.model.dynamic}  # integrators follow
+    old = {
+        places.get(wire.name): layer.modes.poles[: pairs[wire.name]].numpy()
+        for wire, layer in dynamic
+    }
     none = np.zeros(0, dtype=complex)
     if model.is_linear:
         ((wire, _),) = model.dynamic
-        given = _given_poles(model, records, old.get(wire.name, none), seed)
+        given = _given_poles(model, records, old.get(wire.name, none), learnt, seed)
         return [*given, grown(learnt, given[0])], given[0]
     leading = next(iter(leading_layers(model)), None)
     name, fresh, linear = None, None, None
@@ -55,7 +61,7 @@ def extended_starts(
         twin = linear_twin(model, leading.layer, scaling)
         training = records if twin.outputs == model.outputs else one_output(records)
         twin = replace(twin, scaling=training[0].scaling)
-        (fresh, *_) = _given_poles(twin, training, old.get(name, none), seed)
+        (fresh, *_) = _given_poles(twin, training, old.get(name, none), learnt, seed)
         own = {_renamed(site, {name: "g"}): value for site, value in learnt.items()}
         linear = grown(own, fresh, twin.all_sites(training[0].scaling, len(training)))
     topped = isinstance(model.layers[-1], Static) and isinstance(base.model.layers[-1], Dynamic)
@@ -74,10 +80,21 @@ def extended_starts(
 
 
 def _given_poles(
-    model: Model, records: Sequence[PreparedRecord], poles: np.ndarray, seed: int
+    model: Model,
+    records: Sequence[PreparedRecord],
+    poles: np.ndarray,
+    learnt: Values,
+    seed: int,
 ) -> list[Values]:
-    """Values of a linear model by least squares given its poles, and new ones, the best first."""
+    """Values of a linear model by least squares given its poles, and new ones, the best first.
+
+    Inputs arrive after the dead times that are learnt, or typical ones.
+    """
     scaling = records[0].scaling
+    dead: Values = {}
+    if model.late:
+        known = learnt if len(learnt.get(DELAY, ())) == len(model.late) else None
+        dead[DELAY], records = with_delays(model, records, known)
     ((_, layer),) = model.dynamic
     generator = np.random.default_rng(seed)
     kept, more = poles[: layer.pairs], max(0, layer.pairs - len(poles))
@@ -85,7 +102,7 @@ def _given_poles(
     for _ in range(TRIES if more else 1):
         both = np.concatenate([kept, random_poles(more, scaling, generator)])
         found.append(values_given_poles(model, records, scaling, both))
-    return [values for _, values in sorted(found, key=lambda one: one[0])[:KEPT]]
+    return [values | dead for _, values in sorted(found, key=lambda one: one[0])[:KEPT]]
 
 
 def _places(base: Model, model: Model) -> dict[str, str]:

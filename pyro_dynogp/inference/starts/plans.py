@@ -11,11 +11,11 @@ from torch import Tensor
 
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.delays import with_delays
-from pyro_dynogp.inference.starts.dynamic import DynamicStart, Values
+from pyro_dynogp.inference.starts.dynamic import DynamicStart, Values, with_late_inputs
 from pyro_dynogp.inference.starts.linear import Twin, leading_layers, linear_twins
 from pyro_dynogp.inference.starts.static import start_static
 from pyro_dynogp.layers.noise import TYPICAL
-from pyro_dynogp.models.arrival import DELAY
+from pyro_dynogp.models.arrival import DELAY, columns_of
 from pyro_dynogp.models.assembly import assemble
 from pyro_dynogp.models.known import known_function, known_sites, middle_of
 from pyro_dynogp.models.model import Model
@@ -204,13 +204,17 @@ def _linear_state(
     if layer.outputs != model.outputs or not one.channels or other:
         return torch.zeros(len(layer.past_states), dtype=torch.float64)
     noisy = "g_noise_gain_unit" in linear
-    alone = (replace(layer, feedback=(), hidden=0, substeps=1, process_noise=noisy),)
+    own = replace(layer, feedback=(), hidden=0, substeps=1, process_noise=noisy)
+    alone = (replace(own, sees=(), skip=()),)  # a function of inputs is a line as yet
     twin = Model(
         model.inputs, alone, direct=model.direct, initial_state="integrated", scaling=record.scaling
     )
     with torch.no_grad():
         ((place, _),) = twin.dynamic
         named = {place.name + k[1:] if k[:2] == "g_" else k: v for k, v in linear.items()}
+        if (direct := f"{place.name}_feedthrough") in named:
+            late = columns_of(model.late, record.scaling)
+            named[direct] = with_late_inputs(named[direct], place.channels, late)
         system = twin.system(named, record.scaling)
         assembly = assemble(system, record.grid, record.scaled_inputs)
         problem = assembly.with_outputs(record.scaled_outputs)
