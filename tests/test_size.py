@@ -25,7 +25,7 @@ LINES = 31_500
 # lines), quoted files at once, bars of `check` (50 lines), excerpts of long records and feedback in
 # parts of a step (190 lines), problems in units of their own (320 lines) came since. To shrink,
 # and to go.
-LINES_TODAY = 50_830
+LINES_TODAY = 50_850
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

@@ -21,7 +21,7 @@ from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.inference.log_joint import log_joint_of
 from pyro_dynogp.inference.pareto import good_k, psis
 from pyro_dynogp.inference.posterior_draws import PosteriorDraws
-from pyro_dynogp.inference.stability import warnings_of
+from pyro_dynogp.inference.stability import of_numbers, of_poles
 from pyro_dynogp.prediction.predict import predict
 from pyro_dynogp.support.parallel import parallel_map
 from pyro_dynogp.support.shown import shown
@@ -96,7 +96,8 @@ def check(
       sites also that of the whole vector, high in many dimensions even where margins are good.
     - NUTS: R-hat, effective draws, divergences.
     - ELBO: whether it still rose at the end. Starts: whether another one came to the same optimum.
-    - Poles: those that hardly decay within the record, and records of unstable plants.
+    - Poles: those that hardly decay within the record, and records of unstable plants. Numbers:
+      nearly as many in a model with functions as there are outputs.
     - One-step predictions: calibrated on the training record (see `calibration`).
     - Forecasts: of later parts of the training record by refits to what came before them (see
       `leave_future_out`). What holds one step ahead need not hold in a free run.
@@ -138,7 +139,7 @@ def check(
         parts.append(partial(_whole_vector, fit))
     if fit.method == "svi":
         parts.append(partial(_elbo, fit))
-    parts += [partial(_starts, fit), partial(_poles, fit), partial(_predictions, fit)]
+    parts += [partial(one, fit) for one in (_starts, _poles, _numbers, _predictions)]
     findings: list[Finding] = []
     for found in parallel_map(
         lambda part: part(), parts, workers=1, progress=progress, description="posterior"
@@ -237,7 +238,11 @@ def _starts(fit: Fitted) -> Finding:
 
 
 def _poles(fit: Fitted) -> list[Finding]:
-    return [Finding("poles", np.nan, False, sentence) for sentence in warnings_of(fit)]
+    return [Finding("poles", np.nan, False, sentence) for sentence in of_poles(fit)]
+
+
+def _numbers(fit: Fitted) -> list[Finding]:
+    return [Finding("numbers", np.nan, False, sentence) for sentence in of_numbers(fit)]
 
 
 def _predictions(fit: Fitted) -> list[Finding]:

@@ -2,13 +2,14 @@
 
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 import pyro_dynogp as dgp
-from pyro_dynogp.inference.stability import warnings_of
+from pyro_dynogp.inference.stability import of_numbers, warnings_of
 from tests.statistics.test_growth import closed_loop
 
 QUICK = {"restarts": 1, "steps": 30, "workers": 1, "progress": False}
@@ -97,3 +98,30 @@ def test_an_unstable_plant_is_named():
     (said,) = warnings_of(found)
     assert "unstable plant" in said
     assert "reference" in said
+
+
+@pytest.mark.parametrize(("samples", "said"), [(62, True), (63, False)])
+def test_a_model_with_functions_has_fewer_numbers_than_there_are_outputs(samples, said):
+    """Fifty numbers are four fifths of 62.5 outputs; those that are missing do not count."""
+    record = settling(100)
+    y = record.outputs.copy()
+    y[samples:] = np.nan
+    fit = SimpleNamespace(
+        model=dgp.Wiener(1), mode={"a": torch.zeros(25), "b": torch.zeros(5, 5)},
+        records=[record.with_outputs(y)],
+    )  # fmt: skip
+    found = of_numbers(fit)
+    assert bool(found) is said
+    if said:
+        assert f"has 50 free numbers, and there are {samples} measured outputs" in found[0]
+    fit.model = dgp.LinearDynamicGP(1)
+    assert of_numbers(fit) == ()
+
+
+def test_too_many_numbers_are_said_by_the_fit_its_summary_and_check():
+    record = settling(40)
+    with pytest.warns(UserWarning, match="free numbers, and there are 40 measured outputs"):
+        fit = dgp.fit(dgp.Wiener(1, pairs=1), record, method="map", **{**QUICK, "steps": 2})
+    assert "free numbers, and there are 40 measured outputs" in str(fit.summary())
+    found = dgp.check(fit, forecasts=False, draws=50, workers=1, progress=False)
+    assert found["numbers"].good is False
