@@ -1,5 +1,7 @@
 """L-BFGS with Hessians: where it ends, how soon, and that it says why."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,6 +17,7 @@ from pyro_dynogp.inference.optimise.descent import (
     hessian,
     newton,
 )
+from pyro_dynogp.inference.optimise.maximum import _preconditioned
 
 
 def functions_of(value, gradient):
@@ -146,3 +149,18 @@ def test_newton_steps_back_from_where_there_is_no_value():
     np.testing.assert_allclose(found, 1.0, rtol=1e-7)
     _, values = newton(functions, np.array([[-1.0]]))
     assert values[0] == np.inf
+
+
+@pytest.mark.parametrize(("steps", "there"), [(4, False), (5, True)])
+def test_a_hessian_that_costs_more_than_all_iterations_is_not_taken(steps, there):
+    """Forty points, of which eight cost no less than one by itself."""
+    sizes, scales = [], np.geomspace(1.0, 1e4, 40)
+
+    def functions(z):
+        sizes.append(len(z))
+        return 0.5 * (z**2 @ scales), z * scales
+
+    task = SimpleNamespace(steps=steps, goes_on=True)
+    _, history, _ = _preconditioned(functions, np.ones(40), task, 2)
+    assert (max(sizes) > 40) is there
+    assert history[-1] < history[0]

@@ -43,6 +43,7 @@ RIDGE = 200
 TOGETHER, BATCH_SAMPLES = 4, 8000
 
 
+BATCHED = 8  # so many points of a batch cost no less than one by itself
 # Iterations of Gauss-Newton after which starts are ranked, and the share of them that goes on:
 # those from subspace identification rise first, others may end higher.
 RANKED = ((5, 0.75), (15, 0.5), (30, 0.5))
@@ -100,7 +101,11 @@ def _lbfgs(functions: Functions, z: np.ndarray, task: _Task, every: int) -> Clim
 
 
 def _preconditioned(functions: Functions, z: np.ndarray, task: _Task, every: int) -> Climb:
-    return descend(functions, z, task.steps, every=every, first=0 if task.goes_on else None)
+    # A Hessian before the first iteration, unless it costs more than all of them.
+    pays = task.steps >= len(z) / BATCHED
+    return descend(
+        functions, z, task.steps, every=every, first=0 if task.goes_on and pays else None
+    )
 
 
 def _adam(functions: Functions, z: np.ndarray, task: _Task, every: int) -> Climb:
