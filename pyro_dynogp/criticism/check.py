@@ -139,7 +139,7 @@ def check(
         parts.append(partial(_whole_vector, fit))
     if fit.method == "svi":
         parts.append(partial(_elbo, fit))
-    parts += [partial(one, fit) for one in (_starts, _poles, _numbers, _predictions)]
+    parts += [partial(one, fit) for one in (_starts, _warned, _predictions)]
     findings: list[Finding] = []
     for found in parallel_map(
         lambda part: part(), parts, workers=1, progress=progress, description="posterior"
@@ -237,12 +237,9 @@ def _starts(fit: Fitted) -> Finding:
     return Finding("starts", float(count), None, text)
 
 
-def _poles(fit: Fitted) -> list[Finding]:
-    return [Finding("poles", np.nan, False, sentence) for sentence in of_poles(fit)]
-
-
-def _numbers(fit: Fitted) -> list[Finding]:
-    return [Finding("numbers", np.nan, False, sentence) for sentence in of_numbers(fit)]
+def _warned(fit: Fitted) -> list[Finding]:
+    said = {"poles": of_poles(fit), "numbers": of_numbers(fit)}
+    return [Finding(name, np.nan, False, one) for name, several in said.items() for one in several]
 
 
 def _predictions(fit: Fitted) -> list[Finding]:

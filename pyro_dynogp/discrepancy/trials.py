@@ -184,7 +184,7 @@ def with_substeps(trial: Trial, tried: Tried) -> Tried:
     finer = with_usual_substeps(tried.model, trial.base.model)
     if tried.fit is None or finer == tried.model:
         return tried
-    found = run(replace(trial, models=(finer,), base=tried.fit, fit=None))
+    found = run(replace(trial, models=(finer,), base=tried.fit))
     if found.failure or not certain(found.densities - tried.densities, trial.settings):
         return tried
     return found

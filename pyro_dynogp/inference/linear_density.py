@@ -25,7 +25,7 @@ from pyro_dynogp.inference.log_joint import Direct
 from pyro_dynogp.inference.priors_of_vectors import VectorPriors, vector_priors
 from pyro_dynogp.lti.held_lanes import Signals
 from pyro_dynogp.lti.likelihood import Past, Systems, Tape, gradients, innovations_of
-from pyro_dynogp.models.arrival import DELAY, columns_of
+from pyro_dynogp.models.arrival import DELAY, columns_of, prompt_columns
 from pyro_dynogp.models.late_systems import common_step
 from pyro_dynogp.models.past_inputs import LEVEL
 from pyro_dynogp.models.prepared import PreparedRecord, scaled_inputs
@@ -111,7 +111,7 @@ class LinearDensity:
         shapes = {site.name: tuple(site.shape) for site in density.sites}
         scaling, driving = density.records[0].scaling, model.inputs - model.direct
         late = columns_of(model.late, scaling)
-        prompt = tuple(column for column in range(driving) if column not in late)
+        prompt = tuple(prompt_columns(model.late, scaling, driving))
         self._systems = LinearSystems(
             wire.name, layer, driving, model.direct, priors.places, shapes, time, prompt,
             model.reference_of(layer, scaling),

@@ -63,6 +63,12 @@ def columns_of(late: Sequence[Delayed], scaling: Scaling) -> tuple[int, ...]:
     return tuple(scaling.input_names.index(channel.names[0]) for channel in late)
 
 
+def prompt_columns(late: Sequence[Delayed], scaling: Scaling, count: int) -> list[int]:
+    """Columns, of the first ones so many, of inputs that do not come late: they may act at once."""
+    columns = columns_of(late, scaling)
+    return [column for column in range(count) if column not in columns]
+
+
 def medians(late: Sequence[Delayed], scaling: Scaling) -> list[float]:
     """Prior medians (K,) of the dead times [time unit]."""
     usual = math.sqrt(float(scaling.time_step) * float(scaling.duration) / math.pi)

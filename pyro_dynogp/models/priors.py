@@ -35,7 +35,7 @@ from pyro_dynogp.lti.modes import Modes, NoiseStructure
 from pyro_dynogp.lti.views import residues
 from pyro_dynogp.models.horseshoe import horseshoe, horseshoe_sites
 from pyro_dynogp.support.errors import instance, invalid, verify_fields
-from pyro_dynogp.support.tensors import joined
+from pyro_dynogp.support.tensors import at_places, joined
 
 PriorName = Literal["default", "paper"]
 
@@ -247,8 +247,7 @@ class ModesPrior:
             poles, B, c, L, drift = self._with_integrators(values, poles, B, c, L)
         D = values.get(f"{name}_feedthrough")
         if D is not None and len(self._prompt) < self.inputs:
-            whole = D.new_zeros((*D.shape[:-1], self.inputs))
-            D = whole.index_copy(-1, torch.tensor(self._prompt), D)
+            D = at_places(D, self._prompt, self.inputs)
         return Modes(poles, B, c, L, D, noise=self.noise, drift=drift)
 
     def _with_integrators(

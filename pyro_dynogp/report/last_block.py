@@ -49,8 +49,9 @@ def report_of(fits: Sequence[Fit], course: SearchState, warnings: Sequence[str])
     sealed[len(data.known) :] = True
     densities = [one_step_density(one, whole)[sealed] for one in fits]
 
+    there = np.isfinite(densities[0])
+
     def compared(after: int, before: int) -> Compared:
-        there = np.isfinite(densities[0])
         gain = densities[after][there] - densities[before][there]
         error = block_standard_error(gain)[0]
         return Compared(measured[before], measured[after], float(gain.sum()), error,
@@ -61,12 +62,10 @@ def report_of(fits: Sequence[Fit], course: SearchState, warnings: Sequence[str])
     # Where nothing is kept the extended model is the one with everything, for comparison.
     last = kept or count
     base, extended, change = fits[0], fits[last], compared(last, 0)
-    said: list[str] = []
-    if count and not kept:
-        said = [change.harm]
-    elif kept < count:
+    said = change.disagreement
+    if kept < count:
         names = [found.effect.name for found, _ in accepted[kept:]]
-        said = [compared(count, kept).left_out(names)]
+        said = [compared(count, kept).left_out(names) if kept else change.harm, *said]
     watch.stop("scores of the last block")
     tests = _tested([f for f, _ in accepted], (base, extended), whole, sealed, rounds)
     watch.stop("residual tests of the last block")
@@ -80,7 +79,7 @@ def report_of(fits: Sequence[Fit], course: SearchState, warnings: Sequence[str])
     watch.stop("numbers of the effects")
     return Report(
         effects=(*effects, *(_only_reported(f) for f in course.reported)),
-        outcome=_outcome(course, kept < 1 <= count),
+        outcome=_outcome(course, harm=last > kept),
         before=measured[0],
         after=measured[last],
         elpd_gain=change.gain,
@@ -91,7 +90,7 @@ def report_of(fits: Sequence[Fit], course: SearchState, warnings: Sequence[str])
         attempts=tuple(course.attempts),
         tests=tuple(course.tests),
         left=course.left,
-        warnings=(*said, *(change.disagreement if count else ()), *warnings),
+        warnings=(*said, *warnings),
         data=data.sentence,
         last_block_tests=tests,
         sealed=data.sealed,

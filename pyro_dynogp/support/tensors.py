@@ -63,3 +63,9 @@ def as_tensor(
     except (TypeError, ValueError, RuntimeError) as error:
         got = f"{type(value).__name__} ({error})"
         raise invalid(argument, expected="an array of numbers", got=got) from error
+
+
+def at_places(columns: Tensor, places: Sequence[int], count: int) -> Tensor:
+    """Columns (..., k) at their places among so many, the others zero."""
+    whole = columns.new_zeros(*columns.shape[:-1], count)
+    return whole.index_copy(-1, torch.tensor(places), columns)

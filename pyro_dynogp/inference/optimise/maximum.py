@@ -41,9 +41,8 @@ RIDGE = 200
 # Starts that climb together, as long as they have no more samples than this in all: longer records
 # keep a processor busy one by one.
 TOGETHER, BATCH_SAMPLES = 4, 8000
-
-
-BATCHED = 8  # so many points of a batch cost no less than one by itself
+# So many points of a batch cost no less than one by itself.
+BATCHED = 8
 # Iterations of Gauss-Newton after which starts are ranked, and the share of them that goes on:
 # those from subspace identification rise first, others may end higher.
 RANKED = ((5, 0.75), (15, 0.5), (30, 0.5))

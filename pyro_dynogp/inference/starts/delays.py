@@ -18,7 +18,7 @@ from pyro_dynogp.data.signals import delayed
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.starts.poles import starting_values
 from pyro_dynogp.inference.starts.subspace import subspace_starts
-from pyro_dynogp.models.arrival import DELAY, arrived, columns_of, medians
+from pyro_dynogp.models.arrival import DELAY, arrived, columns_of, medians, prompt_columns
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord
 
@@ -140,7 +140,7 @@ def delayed_starts(
     scaling = records[0].scaling
     columns = columns_of(model.late, scaling)
     ((wire, layer),) = model.dynamic
-    prompt = [c for c in range(wire.channels) if c not in columns]
+    prompt = prompt_columns(model.late, scaling, wire.channels)
     at_once = layer.feedthrough and len(prompt) > 0
     plain = replace(model, channels=(), layers=(replace(layer, feedthrough=at_once),))
     direct = f"{wire.name}_feedthrough"

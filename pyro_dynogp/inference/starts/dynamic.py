@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 import torch
@@ -12,10 +12,11 @@ from torch.nn.functional import pad
 from pyro_dynogp.data.scaling import Scaling, TimeScale
 from pyro_dynogp.inference.starts.poles import WALKS, random_poles
 from pyro_dynogp.layers.functions import in_place
-from pyro_dynogp.models.arrival import columns_of
+from pyro_dynogp.models.arrival import prompt_columns
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.models.wiring import Dynamic, Known, Wire
+from pyro_dynogp.support.tensors import at_places
 
 Values = dict[str, Tensor]
 # Size of gains that are there to be learnt.
@@ -26,12 +27,11 @@ INTEGRATORS = ("integrator_gain", "integrator_drift", "integrator_noise")
 MOVED = 0.5
 
 
-def with_late_inputs(direct: Tensor, count: int, late: Sequence[int]) -> Tensor:
+def with_late_inputs(direct: Tensor, model: Model, scaling: Scaling, count: int) -> Tensor:
     """Direct paths (..., count), none from late inputs, where those of the others are given."""
     if direct.shape[-1] == count:
         return direct
-    prompt = torch.tensor([column for column in range(count) if column not in late])
-    return direct.new_zeros(*direct.shape[:-1], count).index_copy(-1, prompt, direct)
+    return at_places(direct, prompt_columns(model.late, scaling, count), count)
 
 
 class DynamicStart:
@@ -92,10 +92,9 @@ class DynamicStart:
             values[self._key(name)] = values[self._key(name)] + self._random(
                 layer.pairs, scale=MOVED
             )
-        shape = self._direct_shape()
-        if self._key("feedthrough") in values and shape is not None:
-            D = values[self._key("feedthrough")]
-            values[self._key("feedthrough")] = with_late_inputs(D, shape[-1], self._late)
+        direct, shape = self._key("feedthrough"), self._direct_shape()
+        if direct in values and shape is not None:
+            values[direct] = with_late_inputs(values[direct], self.model, self.scaling, shape[-1])
         if self.one.fed:
             none = torch.zeros(layer.pairs, 0, 2, dtype=torch.float64)
             gain = values.get(self._key("input_gain"), none)
@@ -103,8 +102,8 @@ class DynamicStart:
             if self._key("integrator_gain") in values:
                 level = values[self._key("integrator_gain")]
                 values[self._key("integrator_gain")] = pad(level, (0, self.one.fed))
-        none = torch.zeros(0, layer.pairs, 2, dtype=torch.float64)
-        known = len(values.get(self._key("output_gain"), none)) or 1
+        gains = values.get(self._key("output_gain"))  # of one signal there is none
+        known = 1 if gains is None else len(gains)
         if layer.width > known:
             values.update(self._more_signals(values, known, ahead))
             if layer.process_noise:
@@ -115,10 +114,6 @@ class DynamicStart:
             noise = ("_noise_gain", "_integrator_noise")
             values = {k: v for k, v in values.items() if not any(part in k for part in noise)}
         return values
-
-    @property
-    def _late(self) -> tuple[int, ...]:
-        return columns_of(self.model.late, self.scaling)
 
     def _more_signals(self, values: Values, known: int, ahead: bool) -> Values:
         """Sites of the layer's signals where the first ones are known: all see the same modes.
@@ -131,6 +126,7 @@ class DynamicStart:
             own = values[self._key("output_gain")]
             own = own / own.square().sum((0, -1), keepdim=True).sqrt()
         rest = layer.width - known
+        # Drawn for all, so that a signal's gains do not depend on how many are known.
         gain = torch.cat([own, self._random(layer.width, P, 2, scale=0.7)[known:]])
         if layer.hidden:
             measured = own[self._signals[0] if known > 1 else 0]

@@ -43,11 +43,8 @@ def extended_starts(
     learnt = {_renamed(site, places): value for site, value in base.mode.items()}
     sites = model.all_sites(scaling, len(records))
     dynamic = base.system_at(base.mode).dynamic
-    pairs = {wire.name: layer.pairs for wire, layer in base.model.dynamic}  # integrators follow
-    old = {
-        places.get(wire.name): layer.modes.poles[: pairs[wire.name]].numpy()
-        for wire, layer in dynamic
-    }
+    both = zip(dynamic, base.model.dynamic, strict=True)  # poles of integrators follow the pairs
+    old = {places.get(w.name): x.modes.poles[: own.pairs].numpy() for (w, x), (_, own) in both}
     none = np.zeros(0, dtype=complex)
     if model.is_linear:
         ((wire, _),) = model.dynamic

@@ -15,7 +15,7 @@ from pyro_dynogp.inference.starts.dynamic import DynamicStart, Values, with_late
 from pyro_dynogp.inference.starts.linear import Twin, leading_layers, linear_twins
 from pyro_dynogp.inference.starts.static import start_static
 from pyro_dynogp.layers.noise import TYPICAL
-from pyro_dynogp.models.arrival import DELAY, columns_of
+from pyro_dynogp.models.arrival import DELAY
 from pyro_dynogp.models.assembly import assemble
 from pyro_dynogp.models.known import known_function, known_sites, middle_of
 from pyro_dynogp.models.model import Model
@@ -213,8 +213,7 @@ def _linear_state(
         ((place, _),) = twin.dynamic
         named = {place.name + k[1:] if k[:2] == "g_" else k: v for k, v in linear.items()}
         if (direct := f"{place.name}_feedthrough") in named:
-            late = columns_of(model.late, record.scaling)
-            named[direct] = with_late_inputs(named[direct], place.channels, late)
+            named[direct] = with_late_inputs(named[direct], model, record.scaling, place.channels)
         system = twin.system(named, record.scaling)
         assembly = assemble(system, record.grid, record.scaled_inputs)
         problem = assembly.with_outputs(record.scaled_outputs)

@@ -17,7 +17,7 @@ from pyro_dynogp.lti.grid import TimeGrid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import held_states
 from pyro_dynogp.lti.views import numerators
-from pyro_dynogp.models.arrival import columns_of
+from pyro_dynogp.models.arrival import prompt_columns
 from pyro_dynogp.models.horseshoe import HORSESHOE_SCALE
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord
@@ -146,8 +146,7 @@ def values_given_poles(
         section = numerators(torch.as_tensor(poles), torch.as_tensor(B)).numpy()
         section = section / np.stack([rate, rate**2], -1)[:, None, :]
         values[f"{g}_input_gain"] = np.clip(section, -10.0, 10.0)
-        late = columns_of(model.late, scaling)
-        prompt = [column for column in range(n_u) if column not in late]
+        prompt = prompt_columns(model.late, scaling, n_u)
         if layer.feedthrough and prompt:
             D = weights[:, -1 - n_u : -1][:, prompt]
             values[f"{g}_feedthrough"] = D if model.several_outputs else D[0]
