@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import TypeVar
 
 import torch
@@ -20,7 +21,7 @@ from pyro_dynogp.inference.methods.svi import Schedule
 from pyro_dynogp.inference.optimise.maximum import (
     Effort,
     maximise,
-    optimizer_by_gradients,
+    optimizer_for,
     optimizer_near,
 )
 from pyro_dynogp.inference.optimise.optimum import Optimum
@@ -33,7 +34,7 @@ from pyro_dynogp.inference.starts.plans import starting_points
 from pyro_dynogp.inference.starts.poles import grown
 from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.variants import differ_in_substeps, without_noise_below_functions
+from pyro_dynogp.models.variants import have_same_parameters, without_noise_below_functions
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import seeded
@@ -41,7 +42,8 @@ from pyro_dynogp.support.parallel import seeded
 # Iterations from the old optima, and of Adam and SVI where they are of a model with functions.
 SAME_STEPS, ADAM_STEPS, SVI_STEPS = 300, 200, 400
 # Iterations of extended models: linear, others of the same layers, with a layer more.
-LINEAR_STEPS, LAYERED_STEPS, ADDED_STEPS = 100, 100, 300
+LINEAR_STEPS, LAYERED_STEPS = 100, 100
+ADDED_STEPS: Mapping[str, int] = MappingProxyType({"gauss-newton": 60, "lbfgs": 300, "adam": 300})
 # Starts from linear fits of its own that a model with a layer more has beside what is learnt, and
 # iterations of those fits.
 FRESH, FRESH_STEPS = 4, 40
@@ -189,11 +191,11 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
 
     With a layer more Adam climbs, as in a first fit: better optimisers get to modes of a free
     function that fit the noise (one that is flat where outputs repeat) and of which its special
-    cases have none, so that gains would be those of climbs. With feedback L-BFGS climbs, which
-    starts near the line (by Gauss-Newton a friction that was added forecast worse), and kernels are
-    then those of the highest evidence. Where the function is far from a line (a sensor that reports
-    a size) the linear fit is any of several poor optima: such a model starts from linear fits of
-    its own, too; a function in feedback from what is learnt, where nothing comes back as yet.
+    cases have none, so that gains would be those of climbs. With feedback Gauss-Newton climbs, and
+    kernels are then those of the highest evidence. Where the function is far from a line (a sensor
+    that reports a size) the linear fit is any of several poor optima: such a model starts from
+    linear fits of its own, too; a function in feedback from what is learnt, where nothing comes
+    back as yet.
 
     A linear model with more poles has the starts of a first fit, too: what is new may take the
     place of what is learnt.
@@ -220,12 +222,13 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     if len(target.layers) > len(fit.model.layers):
         if not (run.steps or (target.has_feedback and fit.model.is_linear)):
             starts += starting_points(target, records, run, count=FRESH, steps=FRESH_STEPS)
-        optima = climb(target, records, starts, [], run, steps=run.steps or ADDED_STEPS,
-                       optimizer=optimizer_by_gradients(target), effort=EXTENDED)  # fmt: skip
+        optimizer = optimizer_for(target)
+        optima = climb(target, records, starts, [], run, optimizer=optimizer, effort=EXTENDED,
+                       steps=run.steps or ADDED_STEPS[optimizer])  # fmt: skip
         return _settled(problem, optima, run)
     if run.steps:  # a few, to compare variants
         starts = [most_probable(problem, starts)]
-    if differ_in_substeps(target, fit.model):  # nothing is new
+    if have_same_parameters(target, fit.model):  # nothing is new
         return _settled(problem, climbed(target, starts[:1], LAYERED_STEPS), run)
     quiet = without_noise_below_functions(target)
     if quiet != target:

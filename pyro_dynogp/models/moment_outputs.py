@@ -19,6 +19,7 @@ from pyro_dynogp.models.output_process import LayerMoments, OutputProcess
 from pyro_dynogp.models.system import System
 from pyro_dynogp.models.wiring import INPUTS
 from pyro_dynogp.moments import filtering, smoothing
+from pyro_dynogp.moments.lane_passes import innovate_together, lanes_serve
 from pyro_dynogp.moments.layout import Layout, Values
 from pyro_dynogp.moments.problem import FilterProblem, each, log_density
 from pyro_dynogp.support.tensors import as_tensor, broadcast
@@ -55,7 +56,12 @@ class MomentOutputs(OutputProcess):
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-density (*s, *batch) of outputs (*s, *batch, *event) [nats]."""
-        total = log_density(self._problem(value))
+        problem = self._problem(value)
+        if lanes_serve(problem) and not problem.wants_gradient:
+            error, variance = (torch.from_numpy(x) for x in innovate_together(problem))
+            total = _normal_density(error, variance).nansum((-2, -1))
+        else:
+            total = log_density(problem)
         there = (~torch.isnan(self.columns(value))).to(torch.float64)
         jacobian = (there * self.scale.log()).sum((-2, -1))
         lead = value.shape[: value.dim() - len(self.event_shape)]
@@ -79,13 +85,22 @@ class MomentOutputs(OutputProcess):
 
     def innovations(self, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """See `OutputProcess`."""
-        error, variance, density = self._pass(y, smoothing.innovate)
-        normal = -0.5 * (error.square() / variance + torch.log(2.0 * math.pi * variance))
-        found = self.scale * error, self.scale.square() * variance, density - normal
+        error, variance, excess = self._innovate(y)
+        found = self.scale * error, self.scale.square() * variance, excess
         if self.several:
             return found
         error, variance, excess = (x.squeeze(-1) for x in found)
         return error, variance, excess
+
+    def _innovate(self, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Scaled innovations (*b, n, n_y), variances, and what log-densities have beyond normal."""
+        problem = self._problem(y)
+        if lanes_serve(problem):
+            both = innovate_together(problem)
+            error, variance = (torch.from_numpy(x)[..., :: self.system.substeps, :] for x in both)
+            return error, variance, torch.zeros_like(error)
+        error, variance, density = self._pass(y, smoothing.innovate)
+        return error, variance, density - _normal_density(error, variance)
 
     def one_step(self, y: Tensor) -> Moments:
         """See `OutputProcess`."""
@@ -172,6 +187,10 @@ class MomentOutputs(OutputProcess):
             out[name] = LayerMoments(known + mean[..., own], sd[..., own])
             start += w
         return out
+
+
+def _normal_density(error: Tensor, variance: Tensor) -> Tensor:
+    return -0.5 * (error.square() / variance + torch.log(2.0 * math.pi * variance))
 
 
 def quiet_last_steps(problem: FilterProblem, count: int) -> FilterProblem:

@@ -194,13 +194,13 @@ def with_usual_substeps(model: Model, base: Model | None = None) -> Model:
     return with_dynamics(model, finer)
 
 
-def differ_in_substeps(model: Model, other: Model) -> bool:
-    """Whether two models, in whatever units, differ in how often they compute feedback alone."""
+def have_same_parameters(model: Model, other: Model) -> bool:
+    """Whether two models differ in their units, and how often they compute feedback, at most."""
     one, two = (
         with_dynamics(replace(m, scaling=None), lambda _, layer: replace(layer, substeps=1))
         for m in (model, other)
     )
-    return one == two and model.substeps != other.substeps
+    return one == two
 
 
 def with_likelihood(model: Model, likelihood: Likelihood) -> Model:

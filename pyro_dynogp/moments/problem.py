@@ -19,6 +19,7 @@ from pyro_dynogp.lti.primitives import run as run_recursion
 from pyro_dynogp.moments import filtering, reverse
 from pyro_dynogp.moments.functions import TABLE, gauss_hermite
 from pyro_dynogp.moments.layout import Layout, Values, zero_bars
+from pyro_dynogp.support.tensors import broadcast
 
 # Dimensions of each value right of the batch.
 EVENTS = {
@@ -79,6 +80,17 @@ class FilterProblem:
     def tensors(self) -> list[Tensor]:
         """In the order of `Values`."""
         return [getattr(self, name) for name in Values._fields]
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """What all batch dimensions broadcast to."""
+        each = ((getattr(self, name), EVENTS[name]) for name in Values._fields)
+        return broadcast(*(x.shape[: x.dim() - event] for x, event in each))
+
+    @property
+    def wants_gradient(self) -> bool:
+        """Whether what is computed from it is differentiated."""
+        return torch.is_grad_enabled() and any(x.requires_grad for x in self.tensors())
 
     def flat(self) -> tuple[list[Tensor], torch.Size]:
         """All tensors with one common batch dimension, and the batch shape."""

@@ -16,6 +16,7 @@ import torch
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.optimise.gauss_newton import Innovations
 from pyro_dynogp.models.architectures import LinearDynamicGP, Wiener
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.nonlinear_feedback import NonlinearFeedback
@@ -58,6 +59,11 @@ class _Plant(NamedTuple):
         potential = Potential(self.model, ((self.record,),), self.values)
         potential.values_and_gradients(potential.pack(self.values).numpy()[None])
 
+    def compare(self) -> None:
+        """Densities of several points, as Gauss-Newton asks for them."""
+        potential = Potential(self.model, ((self.record,),), self.values)
+        Innovations(potential).local(potential.pack(self.values).numpy())
+
     def look(self) -> None:
         """What predictions ask for."""
         y, last = self.record.observations, self.record.inputs[-1]
@@ -85,8 +91,10 @@ def _filter() -> None:
 
 def _smoother() -> None:
     _Plant.of(Wiener(1, pairs=1)).look()
+    looped = _Plant.of(NonlinearFeedback(1, pairs=1))
     with torch.no_grad():
-        _Plant.of(NonlinearFeedback(1, pairs=1)).outputs.sample()
+        looped.outputs.sample()
+    looped.compare()
 
 
 # The longest first. What two of them share is compiled by whichever comes first.

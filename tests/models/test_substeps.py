@@ -17,7 +17,7 @@ from pyro_dynogp.lti.grid import time_grid
 from pyro_dynogp.models.moment_outputs import quiet_last_steps
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.prepared import PreparedRecord
-from pyro_dynogp.models.variants import differ_in_substeps, with_feedback, with_usual_substeps
+from pyro_dynogp.models.variants import have_same_parameters, with_feedback, with_usual_substeps
 from tests.models.closed_loops import (
     check_gradient,
     make_record,
@@ -198,16 +198,18 @@ def test_usual_ones():
     assert parts(dgp.NonlinearFeedback(1, hidden=1, substeps=5), coarse) == 5
 
 
-def test_models_that_differ_in_them_alone():
+def test_models_with_the_same_parameters():
+    """Units and substeps change none; sites, channels and process noise do."""
     one = dgp.NonlinearFeedback(1, hidden=1)
     two = dgp.NonlinearFeedback(1, hidden=1, substeps=1)
-    assert differ_in_substeps(one, two)
     scaled = replace(two, scaling=dgp.Scaling.from_records(make_record(n=60, missing=False)))
-    assert differ_in_substeps(one, scaled)
-    assert not differ_in_substeps(two, scaled)
-    assert not differ_in_substeps(one, one)
-    assert not differ_in_substeps(one, dgp.NonlinearFeedback(1, hidden=1, substeps=1, inducing=4))
-    assert not differ_in_substeps(one, dgp.NonlinearFeedback(1))
+    for other in (one, two, scaled):
+        assert have_same_parameters(one, other)
+        assert have_same_parameters(other, one)
+    few = dgp.NonlinearFeedback(1, hidden=1, substeps=1, inducing=4)
+    quiet = dgp.NonlinearFeedback(1, hidden=1, process_noise=False)
+    for other in (few, quiet, dgp.NonlinearFeedback(1), dgp.NonlinearFeedback(2, hidden=1)):
+        assert not have_same_parameters(one, other)
 
 
 def test_a_refit_with_others_begins_at_what_is_learnt_and_nowhere_else(monkeypatch):

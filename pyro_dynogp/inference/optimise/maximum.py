@@ -300,16 +300,15 @@ def optimizer_for(model: Model) -> Optimizer:
     scales and short lengthscales that make the functions less certain than they are. With feedback
     kernels are found by the evidence afterwards, and L-BFGS stops far below the top.
     """
-    if has_innovations(model) and (model.is_linear or model.has_feedback):
+    if _suits_gauss_newton(model):
         return "gauss-newton"
-    return optimizer_by_gradients(model)
-
-
-def optimizer_by_gradients(model: Model) -> Optimizer:
-    """Adam for functions, but for those in feedback, else L-BFGS."""
     return "adam" if model.has_function and not model.has_feedback else "lbfgs"
 
 
 def optimizer_near(model: Model) -> Optimizer:
     """The optimizer that goes on from near an optimum."""
-    return "gauss-newton" if model.is_linear and has_innovations(model) else "preconditioned"
+    return "gauss-newton" if _suits_gauss_newton(model) else "preconditioned"
+
+
+def _suits_gauss_newton(model: Model) -> bool:
+    return has_innovations(model) and (model.is_linear or model.has_feedback)

@@ -1,0 +1,315 @@
+r"""The filter's predictions one step ahead for points in lanes, forward only; compiled.
+
+The recursion of `smoothing.innovate`, operation by operation, for eight points at a time: what
+differences over many points (Gauss-Newton, Fisher matrices) and densities of many draws need. Noise
+is Gaussian, and outputs are measured through rows of their own. Only the look-up in tables goes
+point by point.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from pyro_dynogp.lti.lanes import WIDTH, get, larger, put, root, splat
+from pyro_dynogp.moments.function_lanes import cubic, expand, locate
+from pyro_dynogp.moments.functions import TABLE
+from pyro_dynogp.moments.layout import FLOOR
+from pyro_dynogp.support.compiled import BORROWING, WITHIN
+
+
+class LaneValues(NamedTuple):
+    """`Values` of one group of points, as arrays of lanes: the last axis is the point.
+
+    Attributes:
+        re to slope: as of `Values`, but for `y`, which all points share.
+        table_mean, table_variance: (WIDTH, E, grid), point by point.
+        varies: (E,) whether a function has a variance of its own at any point.
+        seen_inputs: (D, A), seen_outputs: (n_y, A), fed_back: (k, N, E): where G, H and gamma are
+            not zero at every point.
+    """
+
+    re: np.ndarray
+    im: np.ndarray
+    Q: np.ndarray
+    gamma: np.ndarray
+    m0: np.ndarray
+    P0: np.ndarray
+    G: np.ndarray
+    offset: np.ndarray
+    low: np.ndarray
+    spacing: np.ndarray
+    weight: np.ndarray
+    Z: np.ndarray
+    inverse: np.ndarray
+    constant: np.ndarray
+    slope: np.ndarray
+    H: np.ndarray
+    y_offset: np.ndarray
+    R: np.ndarray
+    table_mean: np.ndarray
+    table_variance: np.ndarray
+    varies: np.ndarray
+    seen_inputs: np.ndarray
+    seen_outputs: np.ndarray
+    fed_back: np.ndarray
+
+
+class Room(NamedTuple):
+    """Work arrays of lanes.
+
+    m (A), P (A A), T (N A), c (A); of one static layer centre (d), W (A d), own covariance (d d)
+    and its root (d d), a node (d), f (Q e), cross and gain (d e); of a table the first of four grid
+    points and the place behind the second (2), and four values (4).
+    """
+
+    m: np.ndarray
+    P: np.ndarray
+    T: np.ndarray
+    c: np.ndarray
+    centre: np.ndarray
+    W: np.ndarray
+    square: np.ndarray
+    root: np.ndarray
+    z: np.ndarray
+    f: np.ndarray
+    cross: np.ndarray
+    gain: np.ndarray
+    place: np.ndarray
+    corner: np.ndarray
+
+
+def room(states: int, outputs: int, channels: int, widest: int, nodes: int) -> Room:
+    """Arrays for one group.
+
+    Args:
+        states: N. outputs: E, of all static layers. channels, widest: most inputs and outputs of
+            one of them. nodes: most nodes.
+    """
+    A, d, e = states + outputs, channels, widest
+    sizes = (A, A * A, states * A, A, d, A * d, d * d, d * d, d, nodes * e, d * e, d * e, 2, 4)
+    return Room(*(np.zeros((max(size, 1), WIDTH)) for size in sizes))
+
+
+@njit(**WITHIN)
+def _weighted(row, first, used, x, stride, count):
+    """Sum of row[first + j] x[j stride] over the entries in use."""
+    total = splat(0.0)
+    for j in range(count):
+        if used[j]:
+            total = total + get(row, first + j) * get(x, j * stride)
+    return total
+
+
+@njit(**WITHIN)
+def _enter(k, N, A, values, own):
+    """Move the state over step k, as `state.move`."""
+    P, T, m = own.P, own.T, own.m
+    E = A - N
+    pairs = N // 2
+    for j in range(pairs):
+        a = get(values.re, k * pairs + j)
+        b = get(values.im, k * pairs + j)
+        q = pairs + j
+        for i in range(A):
+            x = get(P, j * A + i)
+            w = get(P, q * A + i)
+            put(T, j * A + i, a * x - b * w)
+            put(T, q * A + i, b * x + a * w)
+        x = get(m, j)
+        w = get(m, q)
+        put(m, j, a * x - b * w)
+        put(m, q, b * x + a * w)
+    for j in range(N):
+        for f in range(E):
+            if values.fed_back[k, j, f]:
+                t = get(values.gamma, (k * N + j) * E + f)
+                for i in range(A):
+                    put(T, j * A + i, get(T, j * A + i) + t * get(P, (N + f) * A + i))
+                put(m, j, get(m, j) + t * get(m, N + f))
+    for i in range(N):
+        for j in range(pairs):
+            a = get(values.re, k * pairs + j)
+            b = get(values.im, k * pairs + j)
+            q = pairs + j
+            x = get(T, i * A + j)
+            w = get(T, i * A + q)
+            put(P, i * A + j, a * x - b * w + get(values.Q, (k * N + i) * N + j))
+            put(P, i * A + q, b * x + a * w + get(values.Q, (k * N + i) * N + q))
+        for j in range(N):
+            for f in range(E):
+                if values.fed_back[k, j, f]:
+                    t = get(values.gamma, (k * N + j) * E + f)
+                    put(P, i * A + j, get(P, i * A + j) + get(T, i * A + N + f) * t)
+
+
+@njit(**WITHIN)
+def _project(i, time, layout, A, values, own):
+    """Mean of a layer's input, its covariance W with a, and the root of its own."""
+    d = layout.channels[i]
+    first = layout.g_start[i]
+    D = values.seen_inputs.shape[0]
+    na = values.m0.shape[0] + layout.f_start[i]
+    for c in range(d):
+        used = values.seen_inputs[first + c]
+        row = (first + c) * A
+        mean = get(values.offset, time * D + first + c)
+        for j in range(na):
+            if used[j]:
+                mean = mean + get(values.G, row + j) * get(own.m, j)
+        put(own.centre, c, mean)
+        for k in range(na):
+            total = splat(0.0)
+            for j in range(na):
+                if used[j]:
+                    total = total + get(own.P, k * A + j) * get(values.G, row + j)
+            put(own.W, k * d + c, total)
+    for c in range(d):
+        used = values.seen_inputs[first + c]
+        for b in range(c + 1):
+            row = (first + c) * A
+            total = splat(0.0)
+            for j in range(na):
+                if used[j]:
+                    total = total + get(values.G, row + j) * get(own.W, j * d + b)
+            put(own.square, c * d + b, total)
+            put(own.square, b * d + c, total)
+    for c in range(d):
+        for b in range(c + 1):
+            total = get(own.square, c * d + b)
+            for k in range(b):
+                total = total - get(own.root, c * d + k) * get(own.root, b * d + k)
+            if c == b:
+                put(own.root, c * d + c, root(larger(total, splat(0.0)) + splat(FLOOR)))
+            else:
+                put(own.root, c * d + b, total / get(own.root, b * d + b))
+
+
+@njit(**WITHIN)
+def _average(i, layout, A, values, own):
+    """Write E f to m, Var f to P and sum w xi f' of static layer i."""
+    d = layout.channels[i]
+    e = layout.outputs[i]
+    f0 = layout.f_start[i]
+    na = values.m0.shape[0] + f0
+    for a in range(e):
+        put(own.m, na + a, splat(0.0))
+        for b in range(e):
+            put(own.P, (na + a) * A + na + b, splat(0.0))
+        for c in range(d):
+            put(own.cross, c * e + a, splat(0.0))
+    for q in range(layout.node_count[i]):
+        weight = splat(layout.node_weight[i, q])
+        for c in range(d):
+            z = get(own.centre, c)
+            for b in range(c + 1):
+                z = z + get(own.root, c * d + b) * splat(layout.nodes[i, q, b])
+            put(own.z, c, z)
+        if layout.form[i] == TABLE:
+            low = get(values.low, i)
+            scale = splat(1.0) / get(values.spacing, i)
+            locate((get(own.z, 0) - low) * scale, values.table_mean.shape[2], own.place)
+            for a in range(e):
+                put(own.f, q * e + a, cubic(values.table_mean, f0 + a, own.place, own.corner))
+                if values.varies[f0 + a]:
+                    at = (na + a) * A + na + a
+                    more = cubic(values.table_variance, f0 + a, own.place, own.corner)
+                    put(own.P, at, get(own.P, at) + weight * more)
+        else:
+            expand(layout.form[i], i, d, e, f0, q * e, values, own.z, own.f)
+        for a in range(e):
+            f = get(own.f, q * e + a)
+            put(own.m, na + a, get(own.m, na + a) + weight * f)
+            for c in range(d):
+                along = splat(layout.node_weight[i, q] * layout.nodes[i, q, c])
+                put(own.cross, c * e + a, get(own.cross, c * e + a) + along * f)
+    for q in range(layout.node_count[i]):
+        weight = splat(layout.node_weight[i, q])
+        for a in range(e):
+            off = weight * (get(own.f, q * e + a) - get(own.m, na + a))
+            for b in range(e):
+                at = (na + a) * A + na + b
+                other = get(own.f, q * e + b) - get(own.m, na + b)
+                put(own.P, at, get(own.P, at) + off * other)
+
+
+@njit(**WITHIN)
+def _append(i, time, layout, A, values, own):
+    """Append the outputs of static layer i to mean and covariance, as `static_layer.append`."""
+    d = layout.channels[i]
+    e = layout.outputs[i]
+    na = values.m0.shape[0] + layout.f_start[i]
+    _project(i, time, layout, A, values, own)
+    _average(i, layout, A, values, own)
+    for a in range(e):
+        for c in range(d - 1, -1, -1):
+            total = get(own.cross, c * e + a)
+            for b in range(c + 1, d):
+                total = total - get(own.root, b * d + c) * get(own.gain, b * e + a)
+            put(own.gain, c * e + a, total / get(own.root, c * d + c))
+        for k in range(na):
+            total = splat(0.0)
+            for c in range(d):
+                total = total + get(own.W, k * d + c) * get(own.gain, c * e + a)
+            put(own.P, k * A + na + a, total)
+            put(own.P, (na + a) * A + k, total)
+
+
+@njit(**WITHIN)
+def _measure(time, o, y, A, values, own, found):
+    """Use one output; its error and variance go to `found` (2 n n_y)."""
+    n, n_y = y.shape
+    used = values.seen_outputs[o]
+    row = o * A
+    for i in range(A):
+        total = splat(0.0)
+        for j in range(A):
+            if used[j]:
+                total = total + get(own.P, j * A + i) * get(values.H, row + j)
+        put(own.c, i, total)
+    p = _weighted(values.H, row, used, own.c, 1, A)
+    mean = _weighted(values.H, row, used, own.m, 1, A)
+    offset = get(values.y_offset, time * n_y + o)
+    variance = p + get(values.R, time * n_y + o)
+    put(found, time * n_y + o, splat(y[time, o]) - (mean + offset))
+    put(found, (n + time) * n_y + o, variance)
+    beta = splat(1.0) / variance
+    alpha = ((splat(y[time, o]) - offset) - mean) * beta
+    for i in range(A):
+        c = get(own.c, i)
+        put(own.m, i, get(own.m, i) + alpha * c)
+        t = beta * c
+        for j in range(A):
+            at = i * A + j
+            put(own.P, at, get(own.P, at) - t * get(own.c, j))
+
+
+@njit(**BORROWING)
+def innovate_lanes(layout, y, values, own, found):
+    """Write innovations and their variances of one group to found (2, n, n_y, WIDTH).
+
+    y: (n, n_y), NaN where missing; nothing is written there.
+    """
+    n, n_y = y.shape
+    N = values.m0.shape[0]
+    A = values.seen_inputs.shape[1]
+    for j in range(A * A):
+        put(own.P, j, splat(0.0))
+    for j in range(A):
+        put(own.m, j, splat(0.0))
+    for j in range(N):
+        put(own.m, j, get(values.m0, j))
+        for i in range(N):
+            put(own.P, j * A + i, get(values.P0, j * N + i))
+    for time in range(n):
+        k = layout.step[time]
+        if k >= 0:
+            _enter(k, N, A, values, own)
+        for i in range(layout.channels.shape[0]):
+            _append(i, time, layout, A, values, own)
+        for o in range(n_y):
+            if not math.isnan(y[time, o]):
+                _measure(time, o, y, A, values, own, found)

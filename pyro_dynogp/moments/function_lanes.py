@@ -1,0 +1,82 @@
+"""Static functions of `functions` at one node each of eight points; compiled."""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from pyro_dynogp.lti.lanes import WIDTH, below, choose, exponential, get, put, root, splat
+from pyro_dynogp.support.compiled import BORROWING, WITHIN
+
+
+@njit(**WITHIN)
+def locate(t, count, place):
+    """Write where t, in spacings from the first point of a grid, lies, as `functions.place`.
+
+    The first of four grid points, and how far behind the second.
+    """
+    one = splat(1.0)
+    end = splat(count - 2.0)
+    t = choose(t - end, end, choose(t - one, t, one))
+    first = below(t)
+    first = choose(first - splat(count - 3.0), splat(count - 3.0), first)
+    put(place, 0, first - one)
+    put(place, 1, t - first)
+
+
+@njit(**WITHIN)
+def cubic(table, f, place, corner):
+    """Values of function f of each point's table (WIDTH, E, grid), as `functions.between`."""
+    for lane in range(WIDTH):
+        k = int(place[0, lane])
+        for b in range(4):
+            corner[b, lane] = table[lane, f, k + b]
+    u = get(place, 1)
+    a = get(corner, 0)
+    b = get(corner, 1)
+    c = get(corner, 2)
+    d = get(corner, 3)
+    half = splat(0.5)
+    square = a - splat(2.5) * b + splat(2.0) * c - half * d
+    cube = splat(1.5) * (b - c) + half * (d - a)
+    return b + u * (half * (c - a) + u * (square + u * cube))
+
+
+@njit(**WITHIN)
+def radial(form, square):
+    """Value of kappa at r^2, as `functions.radial`."""
+    if form == 1:
+        return exponential(splat(-0.5) * square)
+    r = root(square + splat(1e-30))
+    if form == 2:
+        return exponential(splat(0.0) - r)
+    one = splat(1.0)
+    if form == 3:
+        a = splat(math.sqrt(3.0))
+        return (one + a * r) * exponential(splat(0.0) - a * r)
+    a = splat(math.sqrt(5.0))
+    return (one + a * r + splat(5.0 / 3.0) * square) * exponential(splat(0.0) - a * r)
+
+
+@njit(**BORROWING)
+def expand(form, i, d, e, f0, first, values, z, f):
+    """Write the outputs of the radial expansion of static layer i at z (d) to f, from `first` on.
+
+    d, e: its channels and outputs. f0: its first output among all. values: `LaneValues`.
+    """
+    M, most = values.Z.shape[1], values.Z.shape[2]
+    for a in range(e):
+        total = get(values.constant, f0 + a)
+        for c in range(d):
+            total = total + get(values.slope, (f0 + a) * most + c) * get(z, c)
+        put(f, first + a, total)
+    for m in range(M):
+        square = splat(0.0)
+        for c in range(d):
+            off = get(z, c) - get(values.Z, (i * M + m) * most + c)
+            t = off * get(values.inverse, i * most + c)
+            square = square + t * t
+        value = radial(form, square)
+        for a in range(e):
+            put(f, first + a, get(f, first + a) + get(values.weight, (f0 + a) * M + m) * value)

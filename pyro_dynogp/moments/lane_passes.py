@@ -1,0 +1,70 @@
+"""The filter over many points of a problem, eight at a time where it is one of `filter_lanes`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pyro_dynogp.lti.lanes import WIDTH
+from pyro_dynogp.lti.primitives import array, flatten_batch
+from pyro_dynogp.moments.filter_lanes import LaneValues, innovate_lanes, room
+from pyro_dynogp.moments.problem import EVENTS, FilterProblem, each
+
+# Points from which lanes pay: fewer leave most of them empty.
+FEWEST = 3
+_TABLES = ("table_mean", "table_variance")
+_LANES = tuple(name for name in LaneValues._fields if name in EVENTS and name not in _TABLES)
+
+
+def lanes_serve(problem: FilterProblem) -> bool:
+    """Whether points go through in lanes: several, Gaussian noise, outputs of rows, one y."""
+    layout = problem.layout
+    gaussian = len(layout.share) == 1 and float(layout.multiple[0]) == 1.0
+    rows = gaussian and layout.measured < 0 and problem.y.dim() == 2
+    return rows and problem.batch_shape.numel() >= FEWEST
+
+
+def innovate_together(problem: FilterProblem) -> tuple[np.ndarray, np.ndarray]:
+    """Innovations and their variances (*b, n, n_y) of all points, NaN where outputs are missing.
+
+    A point's numbers are those of `smoothing.innovate`, to the bit, whatever points are beside it.
+
+    Raises:
+        AssertionError: where `lanes_serve` does not hold.
+    """
+    assert lanes_serve(problem)
+    names = [*_LANES, *_TABLES]
+    flat, batch = flatten_batch(
+        [getattr(problem, name) for name in names], [EVENTS[name] for name in names]
+    )
+    count = flat[0].shape[0]
+    y = array(problem.y)
+    parts = dict(zip(names, (array(x) for x in flat), strict=True))
+    layout = problem.layout
+    channels = int(layout.channels.max(initial=1))
+    widest = int(layout.outputs.max(initial=1))
+    N, E = parts["m0"].shape[-1], int(layout.f_start[-1])
+
+    def group(g: int) -> np.ndarray:
+        rows = np.minimum(np.arange(g * WIDTH, (g + 1) * WIDTH), count - 1)
+        own = room(N, E, channels, widest, layout.nodes.shape[1])
+        found = np.full((2, *y.shape, WIDTH), np.nan)
+        innovate_lanes(layout, y, _lane_values(parts, rows), own, found)
+        return np.moveaxis(found, -1, 0)[: count - g * WIDTH]
+
+    found = np.concatenate(each(group, -(-count // WIDTH)))
+    shape = (*batch, *y.shape)
+    return found[:, 0].reshape(shape), found[:, 1].reshape(shape)
+
+
+def _lane_values(parts: dict[str, np.ndarray], rows: np.ndarray) -> LaneValues:
+    """Points of one group; those that fill it are its last one again."""
+    lanes = {name: np.ascontiguousarray(np.moveaxis(parts[name][rows], 0, -1)) for name in _LANES}
+    tables = {name: parts[name][rows] for name in _TABLES}
+    return LaneValues(
+        **lanes,
+        **tables,
+        varies=(tables["table_variance"] != 0.0).any((0, 2)),
+        seen_inputs=(lanes["G"] != 0.0).any(-1),
+        seen_outputs=(lanes["H"] != 0.0).any(-1),
+        fed_back=(lanes["gamma"] != 0.0).any(-1),
+    )

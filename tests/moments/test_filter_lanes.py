@@ -1,0 +1,119 @@
+"""The filter in lanes against the filter of one point."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from pyro_dynogp.lti.lanes import WIDTH
+from pyro_dynogp.moments import smoothing
+from pyro_dynogp.moments.lane_passes import FEWEST, innovate_together, lanes_serve
+from pyro_dynogp.moments.problem import EVENTS, log_density
+from tests.moments.problems import LINE, WIDE, Block, random_problem
+
+TABLES = {
+    "one table": ([LINE], {}),
+    "two tables in a row": ([LINE, LINE], {"pairs": 3}),
+    "two outputs of a table, two of the record": ([WIDE, LINE], {"n_y": 2, "pairs": 1}),
+    "no function": ([], {"n_y": 2}),
+    "one step": ([LINE], {"distinct": 1, "repeated": False}),
+}
+RADIAL = {
+    kernel: ([Block(kernel, 2, 2), LINE, Block(kernel, 3)], {"pairs": 1})
+    for kernel in ("rbf", "matern12", "matern32", "matern52")
+}
+
+
+def together(problems):
+    """Problems with one layout and one y as one of several points."""
+    return replace(
+        problems[0],
+        **{
+            name: torch.stack([getattr(one, name) for one in problems])
+            for name in EVENTS
+            if name != "y"
+        },
+    )
+
+
+def points(case, count):
+    """Problems of one kind with numbers of their own."""
+    blocks, options = {**TABLES, **RADIAL}[case]
+    first = random_problem(blocks, **options)
+    others = [random_problem(blocks, **options, seed=s) for s in range(1, count)]
+    return [first, *(replace(one, layout=first.layout, y=first.y) for one in others)]
+
+
+def one_by_one(problems):
+    """Errors and variances (k, n, n_y) of each problem by itself."""
+    found = []
+    for problem in problems:
+        (values,), _ = problem.elements()
+        found.append(smoothing.innovate(problem.layout, values)[:2])
+    return [np.stack(part) for part in zip(*found, strict=True)]
+
+
+@pytest.mark.parametrize("count", [FEWEST, WIDTH, WIDTH + 3])
+@pytest.mark.parametrize("case", TABLES)
+def test_tables_have_the_same_bits(case, count):
+    problems = points(case, count)
+    for ours, alone in zip(
+        innovate_together(together(problems)), one_by_one(problems), strict=True
+    ):
+        assert np.isnan(alone).any()
+        np.testing.assert_array_equal(ours, alone)
+
+
+@pytest.mark.parametrize("case", RADIAL)
+def test_radial_functions(case):
+    """Exponentials have another last bit."""
+    problems = points(case, 5)
+    for ours, alone in zip(
+        innovate_together(together(problems)), one_by_one(problems), strict=True
+    ):
+        np.testing.assert_allclose(ours, alone, rtol=1e-11, atol=1e-12)
+
+
+def test_batches_of_several_dimensions_and_shared_numbers():
+    """What no point has of its own goes through once for all."""
+    problems = points("two tables in a row", 6)
+    whole = together(problems)
+    own = {name: getattr(whole, name) for name in EVENTS if name not in ("y", "R")}
+    own = {name: x.reshape(2, 3, *x.shape[1:]) for name, x in own.items()}
+    shaped = replace(whole, **own, R=problems[0].R)
+    alone = one_by_one([replace(one, R=problems[0].R) for one in problems])
+    for ours, expected in zip(innovate_together(shaped), alone, strict=True):
+        assert ours.shape == (2, 3, *problems[0].y.shape)
+        np.testing.assert_array_equal(ours.reshape(expected.shape), expected)
+
+
+def test_a_point_without_a_density_leaves_the_others_alone():
+    problems = points("one table", 4)
+    spoiled = [*problems]
+    spoiled[1] = replace(problems[1], R=problems[1].R * torch.nan)
+    clean, found = innovate_together(together(problems)), innovate_together(together(spoiled))
+    assert np.isnan(found[1][1]).all()
+    for before, after in zip(clean, found, strict=True):
+        np.testing.assert_array_equal(before[[0, 2, 3]], after[[0, 2, 3]])
+
+
+def test_densities_are_those_of_the_filter():
+    """Normal log-densities of the innovations add up to the density of one point."""
+    problems = points("two outputs of a table, two of the record", 4)
+    error, variance = innovate_together(together(problems))
+    each = -0.5 * (error**2 / variance + np.log(2.0 * np.pi * variance))
+    expected = [float(log_density(one)) for one in problems]
+    np.testing.assert_allclose(np.nansum(each, (1, 2)), expected, rtol=1e-12)
+
+
+def test_what_goes_through_in_lanes():
+    problems = points("one table", FEWEST)
+    assert lanes_serve(together(problems))
+    assert not lanes_serve(together(problems[:-1]))
+    own = replace(together(problems), y=torch.stack([one.y for one in problems]))
+    assert not lanes_serve(own)
+    for options in ({"student": True}, {"measured": True}):
+        kind = [random_problem([LINE], **options, seed=s) for s in range(FEWEST)]
+        kind = [replace(one, layout=kind[0].layout, y=kind[0].y) for one in kind]
+        assert not lanes_serve(together(kind))
