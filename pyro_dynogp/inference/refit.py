@@ -48,9 +48,10 @@ ADDED_STEPS: Mapping[str, int] = MappingProxyType({"gauss-newton": 60, "lbfgs": 
 # iterations of those fits.
 FRESH, FRESH_STEPS = 4, 40
 # Of the same model every start goes on, near its optimum; of a linear one that is extended half of
-# them do, side by side, as processors are kept busy by other trials.
+# them do, side by side, as processors are kept busy by other trials. With feedback all go on: after
+# few iterations their order says little (of nine plants two chose a start 180 nats below another).
 AGAIN = Effort(kept=1.0, rate=0.004, near=True)
-EXTENDED = Effort(kept=1 / 2, together=8)
+EXTENDED, LOOPED = Effort(kept=1 / 2, together=8), Effort(kept=1.0, together=8)
 # Iterations of all variants of an effect, by Gauss-Newton and of others, and more of the leading
 # ones: this share, three at least.
 FIRST_STEPS, MORE_STEPS = (2, 8), (12, 32)
@@ -205,11 +206,12 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     """
     target, records = problem.target, problem.records
     starts, new = extended_starts(fit, problem.model, records, run.seed)
+    effort = LOOPED if target.has_feedback else EXTENDED
 
     def climbed(model: Model, points: Sequence[Values], usual: int) -> list[Optimum]:
         return maximise(
             model, records, points, run, optimizer=optimizer_near(model), steps=run.steps or usual,
-            effort=EXTENDED, held=_held(model),
+            effort=effort, held=_held(model),
         )  # fmt: skip
 
     if target.is_linear:
@@ -223,7 +225,7 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
         if not (run.steps or (target.has_feedback and fit.model.is_linear)):
             starts += starting_points(target, records, run, count=FRESH, steps=FRESH_STEPS)
         optimizer = optimizer_for(target)
-        optima = climb(target, records, starts, [], run, optimizer=optimizer, effort=EXTENDED,
+        optima = climb(target, records, starts, [], run, optimizer=optimizer, effort=effort,
                        steps=run.steps or ADDED_STEPS[optimizer])  # fmt: skip
         return _settled(problem, optima, run)
     if run.steps:  # a few, to compare variants

@@ -17,7 +17,6 @@ from pyro_dynogp.inference.function_evidence import kernels_by_evidence
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.optimise.gauss_newton import has_innovations
 from pyro_dynogp.inference.optimise.maximum import (
-    EFFORT,
     Effort,
     Optimizer,
     maximise,
@@ -63,6 +62,8 @@ NO_BETTER = (
     "fit: free runs through the training record are no better than those of the linear model that "
     "the climb began from. Try more pairs, other restarts (seed), or a longer record."
 )
+# Half of the starts of models with functions climb to the end.
+HALF = Effort(kept=0.5)
 # Measurement noise, in sds of the outputs, from which starts without process noise climb at least.
 UNEXPLAINED = 0.5
 
@@ -287,7 +288,7 @@ def climb(
     *,
     steps: int,
     optimizer: Optimizer,
-    effort: Effort = EFFORT,
+    effort: Effort = HALF,
     prefix: str = "",
     line: float = math.inf,
 ) -> list[Optimum]:
@@ -303,7 +304,6 @@ def climb(
         steps: most of each start. optimizer, effort: of climbs. prefix: of keys of checkpoints.
         line: error of free runs of the linear model, infinite where noise is not judged.
     """
-    effort = replace(effort, kept=0.5)
 
     def optima_of(target: Model, points: Sequence[Values], key: str) -> list[Optimum]:
         return maximise(
