@@ -108,7 +108,7 @@ def calendar(base: Ground, rng: Generator) -> Planting:
     stamps = base.rig.stamps
     assert stamps is not None
     kind = str(rng.choice(["weekend", "weekday", "working hours", "hour of day"]))
-    hour, day = np.asarray(stamps.hour), np.asarray(stamps.dayofweek)
+    hour, day = np.asarray(stamps.hour), np.asarray(stamps.day_of_week)
     if kind == "weekend":
         course = (day < 5).astype(float)
     elif kind == "weekday":

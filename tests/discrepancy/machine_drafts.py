@@ -47,7 +47,7 @@ class Draft:
         planted: effects that change the output, with amounts.
         u: (n, n_u) recorded inputs. y: (n, n_y) measured. clean: (n, n_y) without noise.
         noise_sd: (n_y,). accepted: names that say each planted effect right.
-        acting, decoys: channels (n,). wanted: set point (n,) of a loop, or None.
+        acting, decoys: channels (n,). loop: around the machine, or None.
         model: to start from.
     """
 
@@ -61,7 +61,7 @@ class Draft:
     accepted: Mapping[str, tuple[str, ...]]
     acting: Sequence[Array]
     decoys: Sequence[Array]
-    wanted: Array | None
+    loop: noise.Loop | None
     model: dgp.Model
 
 
@@ -92,6 +92,8 @@ def draft(
     if found is None or not lively(found[0].u[LEAD:]):
         return None
     rig, amounts, noise_sd = found
+    if "inflow" in rig.numbers and rig.u.min() < 0:  # which a controller of tanks may ask for
+        return None
     channels = [p.channel(amount) for p, amount in amounts if p.channel]
     if not all(lively(channel[:, None], parts=2) for channel in channels):
         return None
@@ -254,7 +256,7 @@ def _finished(
         rig, what, amounts, made.u[LEAD:], limited(made.output + added, amounts),
         limited(made.output, amounts), noise_sd, accepted,
         [p.channel(amount) for p, amount in amounts if p.channel], _decoys(others, rig),
-        None if loop is None else loop.wanted[LEAD:], model,
+        loop, model,
     )  # fmt: skip
 
 

@@ -128,7 +128,7 @@ def dead_time(base: Ground, rng: Generator) -> Planting:
         late = round(amount * parts)
         return np.asarray(np.concatenate([np.repeat(v[:1], late, axis=0), v[: len(v) - late]]))
 
-    return Planting("dead time", ("dead time",), BEYOND_ORDER, (0.3, 40.0), acting=acting)
+    return Planting("dead time", ("dead time",), BEYOND_ORDER, (0.3, 30.0), acting=acting)
 
 
 def dead_zone(base: Ground, rng: Generator) -> Planting:
@@ -151,7 +151,7 @@ def amplifier_limit(base: Ground, rng: Generator) -> Planting:
         return np.asarray(np.clip(v, -top, top))
 
     name = "input nonlinearity"
-    return Planting(name, (name,), BEYOND_LAGS, (0.01, 0.8), acting=acting)
+    return Planting(name, (name,), BEYOND_LAGS, (0.001, 0.8), acting=acting)
 
 
 def curve_of_flow(base: Ground, rng: Generator) -> Planting:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import brentq
 
 from tests.discrepancy.machine_inputs import Array, Generator
 from tests.discrepancy.machine_planting import Planted
@@ -15,8 +14,8 @@ from tests.discrepancy.machine_systems import System, solve, solve_loop
 DEGREES = {"weak": 8.0, "middle": 4.0, "strong": 2.5}
 SPREADS = {"weak": 0.25, "middle": 0.5, "strong": 1.0}
 SHARES = {"weak": 0.1, "middle": 0.2, "strong": 0.3}
-# Noise levels between which a loop is searched for, over the size of the set point.
-LEVELS = (1e-4, 1.0)
+# First noise that is tried in a loop, over the size of the set point, and how many are.
+FIRST, ITERATIONS = 0.05, 15
 # Of a loop with noise, largest size of a sample over that of the set point.
 BOUNDED = 100.0
 
@@ -89,9 +88,9 @@ def random_loop(rng: Generator, rig: Rig) -> Loop:
     held = 1 + rng.geometric(1 / (rig.memory * rng.uniform(1.0, 3.0)), rig.total)
     wanted = mean + swing * np.repeat(rng.uniform(-1, 1, rig.total), held)[: rig.total]
     slow = rig.memory * rig.step
-    gains = (rng.uniform(0.3, 1.5) / gain, slow * rng.uniform(0.7, 1.5))
+    gains = (rng.uniform(0.5, 2.5) / gain, slow * rng.uniform(0.7, 1.5))
     return Loop(
-        wanted, gains, gaussian(rng, rig.total, 1), process_noise(rng, rig), rng.uniform(1.0, 3.0)
+        wanted, gains, gaussian(rng, rig.total, 1), process_noise(rng, rig), rng.uniform(2.0, 6.0)
     )  # fmt: skip
 
 
@@ -118,16 +117,16 @@ def fed_back(rig: Rig, loop: Loop, planted: Planted, share: float) -> tuple[Rig,
     quiet = controlled_input(rig, loop, planted, 0.0)
     size = float(loop.wanted.std())
 
-    def excess(log_level: float) -> float:
-        u = controlled_input(rig, loop, planted, size * np.exp(log_level))
-        if not np.isfinite(u).all():
-            return np.inf
-        return float((u - quiet)[LEAD:].std() / u[LEAD:].std() / share - 1)
-
-    low, high = np.log(LEVELS)
     if not np.isfinite(quiet).all() or np.abs(quiet - quiet.mean()).max() > BOUNDED * rig.u.std():
         return None
-    if not excess(low) < 0 < excess(high) < np.inf:
-        return None
-    level = size * float(np.exp(brentq(excess, low, high, xtol=1e-4)))
-    return replace(rig, u=controlled_input(rig, loop, planted, level)), level
+    level = FIRST * size
+    for _ in range(ITERATIONS):
+        u = controlled_input(rig, loop, planted, level)
+        if not np.isfinite(u).all():
+            return None
+        found = float((u - quiet)[LEAD:].std() / u[LEAD:].std())
+        if abs(found / share - 1) < 1e-3:
+            return replace(rig, u=u), level
+        # Of independent parts the share is a L / sqrt(b + a^2 L^2), of which this is Newton's step.
+        level *= float(np.exp(np.clip(np.log(share / found) / (1 - found**2), -2.0, 2.0)))
+    return None

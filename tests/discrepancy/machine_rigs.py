@@ -110,7 +110,10 @@ def motor(rng: Generator, samples: int, split: str, *, position: bool = False) -
     speed = System(A, B, np.array([[0.0, 1.0]]), np.zeros(1), np.zeros(2))
     memory = rng.uniform(5.0, 12.0)
     u = near(rng, 12.0) * excitation(rng, LEAD + samples, memory, split)
-    numbers = {"constant": constant, "resistance": resistance, "inertia": inertia}
+    numbers = {
+        "constant": constant, "resistance": resistance, "inductance": inductance,
+        "inertia": inertia, "friction": friction,
+    }  # fmt: skip
     rig = _rig(
         speed, u, slowest(speed) / memory, samples, 2, split, ("voltage", "speed"), ("V", "rad/s"),
         numbers,

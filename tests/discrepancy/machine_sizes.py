@@ -5,9 +5,10 @@ Sizes are root mean squares over the record of a change of the output [output]:
 - PLAIN: of the difference that the effect makes, less its mean. For shifts, drifts, periodic
   disturbances and undeclared inputs, which no response of the inputs explains but by chance.
 - BEYOND LAGS: of what is left of that difference by least squares on a constant and lags of the
-  recorded input, five times the slowest time constant, a fifth of the record at most. Where the
-  machine without the effect is linear, this is what a long linear model leaves of the output. For
-  nonlinearities, calendars and shifted clocks.
+  recorded input, up to five times the slowest time constant, a fifth of the record at most, without
+  combinations of lags below 1e-4 of the largest. Where the machine without the effect is linear,
+  this is what a long linear model leaves of the output. For nonlinearities, calendars and shifted
+  clocks.
 - BEYOND ORDER: of what is left of the output by the best linear system of the order that the model
   to start from has. For dead time and unmodelled dynamics, which a long linear model would explain.
 - INTEGRAL: of what is left of the output by the same least squares as BEYOND LAGS; without the
@@ -19,7 +20,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from tests.discrepancy.machine_inputs import Array
@@ -35,8 +36,10 @@ from tests.discrepancy.machine_planting import (
 from tests.discrepancy.machine_rigs import LEAD, Rig
 
 LAGS, SHARE = 5.0, 5
-# Restarts of the search for poles, in multiples of the rates of the machine.
-RATES = (1.0, 0.5)
+# Of smooth inputs, combinations of lags that are smaller than this are none that a model could use.
+WEAKEST = 1e-4
+# Of the search for a system of some order.
+ITERATIONS, EVALUATIONS, LARGEST_POLE = 25, 30, 0.9995
 
 
 def rms(x: Array) -> Array:
@@ -51,55 +54,69 @@ def number_of_lags(rig: Rig) -> int:
 
 def beyond_lags(rig: Rig, u: Array, change: Array) -> Array:
     """What is left (n, n_y) of a change by least squares on lags of the inputs u (total, n_u)."""
-    lags = number_of_lags(rig)
+    lags, x = number_of_lags(rig), u - u.mean(axis=0)
     rows = LEAD + np.arange(rig.samples)[:, None] - np.arange(lags + 1)
-    columns = np.column_stack([np.ones(rig.samples), u[rows].reshape(rig.samples, -1)])
-    weights = np.linalg.lstsq(columns, change, rcond=1e-10)[0]
+    columns = np.column_stack([np.ones(rig.samples), x[rows].reshape(rig.samples, -1) / x.std()])
+    weights = np.linalg.lstsq(columns, change, rcond=WEAKEST)[0]
     return np.asarray(change - columns @ weights)
 
 
 def beyond_order(rig: Rig, u: Array, y: Array, order: int) -> Array:
     """Output (n,) of the best linear system of an order, with feedthrough and a constant.
 
-    Least squares over the poles, for each of which the zeros follow by linear least squares.
+    Least squares over the denominator, for each of which the numerator follows by linear least
+    squares; from the best of the iterations of Steiglitz and McBride (IEEE Trans. Automatic Control
+    10:461, 1965), and from the machine's own poles.
 
     Args:
-        rig: the machine. u: (total, 1) input. y: (n,) output. order: of the system, even.
+        rig: the machine. u: (total, 1) input. y: (n,) output. order: of the system.
     """
-    x, window = u[:, 0] - u[:, 0].mean(), slice(LEAD, None)
-    count = order // 2
+    x, level = u[:, 0] - u[:, 0].mean(), float(y.mean())
+    own = np.exp(rig.system.rates * rig.step)
+    denominators = [_stable(np.poly(np.resize(own, order)).real[1:])]
+    for _ in range(ITERATIONS):
+        denominators.append(_equation_error(x, y - level, denominators[-1]))
 
-    def fitted(points: Array) -> Array:
-        denominator = np.ones(1)
-        # Pairs of poles within the unit circle: 1 - (1 + q) p z^-1 + q z^-2, with q in (0, 1).
-        for a, b in points.reshape(count, 2):
-            q, p = 0.999 / (1 + np.exp(-a)), 0.9995 * np.tanh(b)
-            denominator = np.convolve(denominator, [1.0, -(1 + q) * p, q])
-        base = lfilter([1.0], denominator, x)
-        delayed = [np.concatenate([np.zeros(k), base[: len(base) - k]]) for k in range(order + 1)]
-        columns = np.column_stack([np.ones(len(y)), *(z[window] for z in delayed)])
-        columns /= np.sqrt(np.mean(np.square(columns), axis=0))
-        return np.asarray(columns @ np.linalg.lstsq(columns, y, rcond=1e-12)[0])
+    def left(denominator: Array) -> Array:
+        return np.asarray(y - _fitted(x, y, _stable(denominator)))
 
-    def loss(points: Array) -> float:
-        return float(np.log(np.mean(np.square(y - fitted(points))) + 1e-14 * y.var()))
-
-    starts = [_points(np.exp(rate * rig.system.rates * rig.step), count) for rate in RATES]
-    options = {"maxfev": 120 * count, "xatol": 1e-3, "fatol": 1e-4}
-    found = [minimize(loss, start, method="Nelder-Mead", options=options) for start in starts]
-    return fitted(min(found, key=lambda f: float(f.fun)).x)
+    losses = [float(np.square(left(a)).sum()) for a in denominators]
+    starts = [denominators[0], denominators[int(np.argmin(losses))]]
+    found = [least_squares(left, a, max_nfev=EVALUATIONS, xtol=1e-6, ftol=1e-6) for a in starts]
+    return np.asarray(y - min(found, key=lambda f: float(f.cost)).fun)
 
 
-def _points(poles: np.ndarray, count: int) -> Array:
-    """Parameters of pairs near the given poles, each of which stands for one pair."""
-    chosen = sorted((p for p in poles if p.imag >= 0 and abs(p) < 0.9999), key=lambda p: -abs(p))
-    chosen = (chosen * count)[:count]
-    out = []
-    for k, p in enumerate(chosen):
-        q = float(np.clip(abs(p) ** 2 * (0.9 if p.imag == 0 else 1.0) ** (k + 1), 1e-3, 0.99))
-        middle = float(np.clip(2 * p.real / (1 + q), -0.999, 0.999))
-        out.append([np.log(q / (0.999 - q)), np.arctanh(middle / 0.9995)])
-    return np.array(out).ravel()
+def _late(x: Array, lags: range) -> list[Array]:
+    return [np.concatenate([np.zeros(k), x[: len(x) - k]]) for k in lags]
+
+
+def _stable(denominator: Array) -> Array:
+    """Coefficients (order,) of a denominator with its roots moved into a circle below one."""
+    roots = np.roots([1.0, *denominator])
+    if (np.abs(roots) <= LARGEST_POLE).all():
+        return denominator
+    inside = roots * np.minimum(1.0, LARGEST_POLE / np.maximum(np.abs(roots), 1e-12))
+    return np.asarray(np.poly(inside).real[1:])
+
+
+def _fitted(x: Array, y: Array, denominator: Array) -> Array:
+    """Output (n,) of the best system with that denominator for the input x (total,)."""
+    base, n = lfilter([1.0], [1.0, *denominator], x), len(y)
+    late = [column[-n:] for column in _late(base, range(len(denominator) + 1))]
+    columns = np.column_stack([np.ones(n), *late])
+    columns /= np.abs(columns).max(axis=0)
+    return np.asarray(columns @ np.linalg.lstsq(columns, y, rcond=1e-12)[0])
+
+
+def _equation_error(x: Array, y: Array, denominator: Array) -> Array:
+    """The next denominator: least squares of the difference equation, filtered by the last one."""
+    order, n = len(denominator), len(y)
+    filtered, output = (lfilter([1.0], [1.0, *denominator], signal) for signal in (x, y))
+    inputs = [column[-n:] for column in _late(filtered, range(order + 1))]
+    outputs = [-column for column in _late(output, range(1, order + 1))]
+    settled = slice(min(60, n // 4), None)  # the filter of the output starts at rest
+    columns = np.column_stack([*outputs, *inputs, np.ones(n)])[settled]
+    return _stable(np.linalg.lstsq(columns, output[settled], rcond=1e-12)[0][:order])
 
 
 def relative_size(base: Ground, planting: Planting, amount: float) -> Array:

@@ -195,8 +195,8 @@ def _machine(
     channels = [*made.acting, *made.decoys]
     names = [f"channel {k + 1}" for k in rng.permutation(len(channels))]
     extra = dict(sorted(zip(names, channels, strict=True)))
-    if made.wanted is not None:
-        extra["set point"] = made.wanted
+    if made.loop is not None:
+        extra["set point"] = made.loop.wanted[-n:]
     n_u = made.u.shape[1]
     record = dgp.Record(
         np.arange(n) * rig.step if rig.stamps is None else rig.stamps,
