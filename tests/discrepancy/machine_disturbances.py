@@ -1,4 +1,4 @@
-"""Effects that go with time or with other channels; each builder draws what is random."""
+"""Effects that depend on time or on other channels; each builder draws what is random."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from tests.discrepancy import machine_noise as noise
 from tests.discrepancy import machine_rigs as rigs
 from tests.discrepancy.machine_effects import BUILDERS
 from tests.discrepancy.machine_inputs import Array, Generator, decoy
-from tests.discrepancy.machine_outside import random_outside
+from tests.discrepancy.machine_outside import BUILDERS as OUTSIDE_BUILDERS
 from tests.discrepancy.machine_planting import Ground, Planting, ground, limited, run
 from tests.discrepancy.machine_rigs import LEAD, Rig
 from tests.discrepancy.machine_sizes import relative_size
@@ -35,6 +35,8 @@ WANTED = (0.015, 0.1)
 TOLERANCE, STEPS = 0.04, 8
 # Least standard deviation of a signal in a part of the record, over that in the whole.
 QUIET = 0.2
+# Stands for the excess of an effect with which a loop is not stable.
+UNSTABLE = 10.0
 Amounts = list[tuple[Planting, float]]
 
 
@@ -101,11 +103,11 @@ def draft(
 
 
 def outside_draft(
-    strength: str, samples: int, split: str, source: np.random.SeedSequence
+    which: int, strength: str, samples: int, split: str, source: np.random.SeedSequence
 ) -> Draft | None:
-    """One draw of a machine whose effect is not in the catalogue; see `draft`."""
+    """One draw of a machine whose effect is not in the catalogue, by its number; see `draft`."""
     plan, shaken, others = map(np.random.default_rng, source.spawn(3))
-    chosen = random_outside(plan, samples, split)
+    chosen = OUTSIDE_BUILDERS[which % len(OUTSIDE_BUILDERS)](plan, samples, split)
     if not lively(chosen.rig.u[LEAD:]):
         return None
     base = ground(chosen.rig)
@@ -205,15 +207,20 @@ def _in_loop(
         amount = float(np.exp(log_amount))
         found = noise.fed_back(rig, loop, [(planting, amount)], share)
         if found is None:
-            return np.nan
+            return UNSTABLE
         around = ground(found[0])
         size = float((relative_size(around, planting, amount) * around.sd)[0])
         return float(np.log(max(size / found[1], 1e-12) / MULTIPLES[strength]))
 
-    low, high = np.log(planting.amounts)
-    if not excess(low) < 0 < excess(high):
+    tried, errors = np.linspace(*np.log(planting.amounts), STEPS), list[float]()
+    for at in tried:
+        errors.append(excess(at))
+        if errors[-1] >= 0:
+            break
+    if len(errors) == 1 or errors[-1] < 0:
         return None
-    amount = float(np.exp(brentq(excess, low, high, xtol=1e-3)))
+    bracket = tried[len(errors) - 2 : len(errors)]
+    amount = float(np.exp(brentq(excess, *bracket, xtol=2e-3)))
     found = noise.fed_back(rig, loop, [(planting, amount)], share)
     if found is None or abs(excess(np.log(amount))) > TOLERANCE:
         return None

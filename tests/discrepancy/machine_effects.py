@@ -30,18 +30,18 @@ def nonlinear_feedback(base: Ground, rng: Generator) -> Planting:
     del rng
     numbers = base.rig.numbers
     if "inflow" in numbers:
-        change, amounts = _root_outflow(base), (0.01, 1.0)
+        change, amounts = _root_outflow(base), (0.02, 1.0)
     elif "spring" in numbers:
-        change, amounts = _cubic_spring(base), (1e-3, 30.0)
+        change, amounts = _cubic_spring(base), (0.003, 30.0)
     else:
-        change, amounts = _coulomb_friction(base), (1e-3, 0.7)
+        change, amounts = _coulomb_friction(base), (0.01, 1.6)
     return Planting(
         "nonlinear feedback", ("nonlinear feedback",), BEYOND_LAGS, amounts, system=change
     )  # fmt: skip
 
 
 def _root_outflow(base: Ground) -> Callable[[System, float], System]:
-    """Amount: share of the outflow that goes with the square root of the level."""
+    """Amount: share of the outflow that follows the square root of the level."""
     numbers, tanks = base.rig.numbers, len(base.rig.system.A)
 
     def change(system: System, amount: float) -> System:
@@ -155,7 +155,7 @@ def amplifier_limit(base: Ground, rng: Generator) -> Planting:
 
 
 def curve_of_flow(base: Ground, rng: Generator) -> Planting:
-    """Heat goes with the logarithm or the root of the flow; amount: share of that curve."""
+    """Heat follows the logarithm or the root of the flow; amount: share of that curve."""
     flow = base.rig.numbers["flow"]
     root = bool(rng.uniform() < 0.5)
 

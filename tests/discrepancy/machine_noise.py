@@ -1,4 +1,4 @@
-"""Measurement noise, process noise, and machines under a controller that hears both."""
+"""Measurement noise, process noise, and machines under a controller that both disturb."""
 
 from __future__ import annotations
 

@@ -25,12 +25,6 @@ class Outside:
     channels: tuple[Array, ...] = ()
 
 
-def random_outside(rng: Generator, samples: int, split: str) -> Outside:
-    """One of four machines, drawn."""
-    builders = (valve, switched_spring, product_of_channels, times_the_past)
-    return builders[int(rng.integers(len(builders)))](rng, samples, split)
-
-
 def with_second_input(rig: Rig, u: Array, acts: Array, name: str, unit: str) -> Rig:
     """The machine with another input (total,) that acts on its states by `acts` (s,)."""
     system, (first, *rest) = rig.system, rig.names
@@ -74,7 +68,7 @@ def switched_spring(rng: Generator, samples: int, split: str) -> Outside:
 
 
 def product_of_channels(rng: Generator, samples: int, split: str) -> Outside:
-    """The gain of the exchanger goes with the slow product of two channels."""
+    """The gain of the exchanger follows the slow product of two channels."""
     rig = exchanger(rng, samples, split)
     slow = [excitation(rng, rig.total, 5 * rig.memory, split, "filtered noise") for _ in range(2)]
     product = slow[0] * slow[1]
@@ -108,3 +102,6 @@ def times_the_past(rng: Generator, samples: int, split: str) -> Outside:
 
     planting = Planting(NAME, (), BEYOND_LAGS, (0.01, 1.0), acting=acting)
     return Outside("times the past", rig, planting)
+
+
+BUILDERS = (valve, switched_spring, product_of_channels, times_the_past)

@@ -11,7 +11,7 @@ from tests.discrepancy.machine_inputs import Array
 from tests.discrepancy.machine_rigs import LEAD, Rig
 from tests.discrepancy.machine_systems import System, solve
 
-# How the size of an effect is measured; `machine_sizes` tells what each means.
+# How the size of an effect is measured; see `machine_sizes`.
 PLAIN, BEYOND_LAGS, BEYOND_ORDER, INTEGRAL = "plain", "beyond lags", "beyond order", "integral"
 
 

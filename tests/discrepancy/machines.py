@@ -13,7 +13,8 @@ the noise is the same share of both outputs. Effects of the noise have strengths
 - heteroscedastic noise: the logarithm of its standard deviation has a standard deviation of 0.25,
   0.5 or 1 along the input or the output;
 - process noise: 1, 2 or 4 times the measurement noise, at the output;
-- feedback: of the input's standard deviation, noise and disturbances cause 0.1, 0.2 or 0.3.
+- feedback: of the input's standard deviation, noise and disturbances cause 0.1, 0.2 or 0.3. A
+  loop without this effect has the input that the controller makes without any noise.
 
 The amount of an effect is chosen for a noise between 1.5 and 10 % of the output; machines whose
 noise is not between 1 and 12 % of the output's standard deviation are drawn again.
@@ -142,8 +143,8 @@ def outside(
 ) -> Machine:
     """One machine whose effect no block of the catalogue stands for; see `machine`.
 
-    A valve that a second input moves, a spring that changes with a hidden switch, a gain times the
-    product of two channels, or an input times the past of another.
+    In turn, by seed: a valve that a second input moves, a spring that changes with a hidden switch,
+    a gain times the product of two channels, an input times the past of another. `kind` says which.
     """
     _check(seed, strength, samples, split)
     if samples is None:
@@ -151,7 +152,7 @@ def outside(
     key = [HALVES[split], zlib.crc32(OUTSIDE.encode()), STRENGTHS.index(strength), seed]
     for attempt in range(ATTEMPTS):
         source = np.random.SeedSequence([*key, attempt])
-        made = outside_draft(strength, samples, split, source)
+        made = outside_draft(seed, strength, samples, split, source)
         if made is not None and _noise_fits(made):
             return _machine(made, made.what, (OUTSIDE,), strength, seed, source)
     raise ValueError(
@@ -182,8 +183,8 @@ def _length(kind: str, effects: tuple[str, ...], seed: int, split: str) -> int:
 
 
 def _noise_fits(made: Draft) -> bool:
-    share = made.noise_sd / made.clean.std(axis=0)
-    return bool((share >= NOISE[0]).all() and (share <= NOISE[1]).all())
+    least, most = (share * made.clean.std(axis=0) for share in NOISE)
+    return bool((made.noise_sd >= least).all() and (made.noise_sd <= most).all())
 
 
 def _machine(
