@@ -113,10 +113,10 @@ def integrator(base: Ground, rng: Generator) -> Planting:
     del base, rng
 
     def prepare(rig: Rig, amount: float) -> Rig:
-        width = max(number_of_lags(rig) // 3, 5)
+        width = max(number_of_lags(rig) // 6, 3)
         return replace(rig, u=without_slow_part(rig.u[:, 0], width, amount)[:, None])
 
-    return Planting("integrator", ("integrator",), INTEGRAL, (1e-4, 1.0), prepare=prepare)
+    return Planting("integrator", ("integrator",), INTEGRAL, (1e-3, 1.0), prepare=prepare)
 
 
 def dead_time(base: Ground, rng: Generator) -> Planting:

@@ -97,12 +97,15 @@ def correlation_length(x: Array) -> float:
 
 
 def without_slow_part(x: Array, width: int, kept: float) -> Array:
-    """The signal less a share 1 - kept of its moving average over 2 width + 1 samples."""
-    padded = np.pad(x, width, mode="reflect")
-    sums = np.cumsum(np.concatenate([[0.0], padded]))
+    """The signal less a share 1 - kept of its moving average, three times.
+
+    The average is over 2 width + 1 samples; three times, so that little of the slow part is left.
+    """
     span = 2 * width + 1
-    average = (sums[span:] - sums[:-span]) / span
-    return np.asarray(x - (1 - kept) * average)
+    for _ in range(3):
+        sums = np.cumsum(np.concatenate([[0.0], np.pad(x, width, mode="reflect")]))
+        x = x - (1 - kept) * (sums[span:] - sums[:-span]) / span
+    return x
 
 
 @functools.cache

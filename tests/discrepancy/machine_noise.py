@@ -128,5 +128,6 @@ def fed_back(rig: Rig, loop: Loop, planted: Planted, share: float) -> tuple[Rig,
         if abs(found / share - 1) < 1e-3:
             return replace(rig, u=u), level
         # Of independent parts the share is a L / sqrt(b + a^2 L^2), of which this is Newton's step.
-        level *= float(np.exp(np.clip(np.log(share / found) / (1 - found**2), -2.0, 2.0)))
+        change = np.log(share / found) / max(1 - found**2, 0.05)
+        level *= float(np.exp(np.clip(change, -2.0, 2.0)))
     return None
