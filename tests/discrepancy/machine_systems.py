@@ -104,7 +104,7 @@ def solve_loop(
     return np.asarray(
         _controlled(
             system.rest, wanted, disturbance, proportional, proportional * step / reset, bias,
-            system.C[0], float(system.level[0]), step / parts, parts, *_packed(system),
+            system.C[0], float(system.level[0]), step / parts, parts, _packed(system),
         )
     )  # fmt: skip
 
@@ -173,12 +173,11 @@ def _solved(x, v, h, parts, A, B, codes, sees, acts, scales, columns):  # type: 
 
 @numba.njit(cache=True)
 def _controlled(  # type: ignore[no-untyped-def]
-    x, wanted, disturbance, gain, reset, bias, C, level, h, parts,
-    A, B, codes, sees, acts, scales, columns,
+    x, wanted, disturbance, gain, reset, bias, C, level, h, parts, packed,
 ):  # fmt: skip
     n = len(wanted)
     u = np.zeros(n)
-    v = np.zeros(B.shape[1])
+    v = np.zeros(packed[1].shape[1])
     total = 0.0
     for k in range(n):
         y = level + disturbance[k]
@@ -189,5 +188,5 @@ def _controlled(  # type: ignore[no-untyped-def]
         u[k] = bias + gain * error + total
         v[0] = u[k]
         for _ in range(parts):
-            x = _advanced(x, v, h, A, B, codes, sees, acts, scales, columns)
+            x = _advanced(x, v, h, *packed)
     return u
