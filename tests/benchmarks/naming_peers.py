@@ -11,6 +11,7 @@ the first two also at a level of 5 % for all that they look at together.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -109,7 +110,7 @@ def indicators(e: Array, level: float) -> Indicators:
     steps = [int(rest[k]) for k in selected_steps(e[rest], moved, level)]
     means = np.zeros(n)
     edges = [0, *steps, n]
-    for first, last in zip(edges[:-1], edges[1:], strict=True):
+    for first, last in itertools.pairwise(edges):
         means[first:last] = e[[k for k in range(first, last) if k not in single]].mean()
     return Indicators(tuple(steps), _impulses(e - means, single, len(edges) - 1, level))
 
