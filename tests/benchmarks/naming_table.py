@@ -217,12 +217,12 @@ def _error_table(rows: Sequence[Row]) -> str:
 def _outside_table(rows: Sequence[Row]) -> str:
     own = [row for row in rows if row["group"] == "outside"]
     counts = Counter(
-        (row["strength"], row["outcome"], ", ".join(row["named"]) or "nothing",
+        (row["what"], row["strength"], row["outcome"], ", ".join(row["named"]) or "nothing",
          "yes" if says_outside(row) else "no")
         for row in own
     )  # fmt: skip
     lines = [[*key, str(count)] for key, count in sorted(counts.items())]
-    return table(["strength", "outcome", "named", "cause left open", "cases"], lines)
+    return table(["machine", "strength", "outcome", "named", "cause left open", "cases"], lines)
 
 
 def _search_table(rows: Sequence[Row]) -> str:
