@@ -183,9 +183,10 @@ def _in_words(said: Sequence[str]) -> Said:
 def peers_of(fit: dgp.Fit, record: dgp.Record, training: int) -> dict[str, dict[str, Any]]:
     """What each tool says of a fit, by tool and part of the record, as JSON has it.
 
-    Of several outputs each is looked at, and all that is said counts.
+    Of several outputs each is looked at, and all that is said counts. Errors are over their
+    standard deviation, as the first ones, of an unknown state, are large.
     """
-    residuals = record.outputs - fit.predict(record, horizon=1).mean
+    residuals = fit.innovations(record)
     simulated = fit.simulate(record).mean
     out: dict[str, dict[str, Any]] = {}
     for part, length in (("training part", training), ("whole record", len(record))):
