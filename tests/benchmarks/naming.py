@@ -233,7 +233,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--kept", type=Path, default=KEPT)
     given = parser.parse_args(arguments)
     words = {name: getattr(given, name) for name in names if getattr(given, name)}
-    choice = choice_of(given.split, given.oracle, **words)
+    choice = choice_of(words, given.split, given.oracle)
     print(run(given.kept, choice, given.workers, given.seconds, given.kept, given.again))
     return 0
 

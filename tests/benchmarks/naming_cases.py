@@ -130,10 +130,10 @@ def chosen_by(environment: Mapping[str, str]) -> Choice:
     """The choice that variables name."""
     words = {name: environment.get(f"NAMING_{name.upper()}") for name in
              ("seeds", "kinds", "strengths", "groups")}  # fmt: skip
-    return choice_of(**{name: text for name, text in words.items() if text})
+    return choice_of({name: text for name, text in words.items() if text})
 
 
-def choice_of(split: str = "development", oracle: bool = False, **words: str) -> Choice:
+def choice_of(words: Mapping[str, str], split: str = "development", oracle: bool = False) -> Choice:
     """From texts: names with commas between them, and seeds as "3" or "0-4".
 
     Raises:

@@ -7,7 +7,7 @@ steps, and the periods of the calendar.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numba
@@ -22,7 +22,9 @@ Said = tuple[Group, ...]
 # Lags of signals in the library, and of functions of them; steps on a grid of as many parts.
 LINEAR, CURVED, STEPS = 10, 3, 40
 PENALTIES, LEAST_PENALTY = 40, 0.03
-FORMS = {"square": np.square, "cube": lambda x: x**3, "absolute": np.abs, "sign": np.sign}
+FORMS: Mapping[str, Callable[[Array], Array]] = {
+    "square": np.square, "cube": lambda x: x**3, "absolute": np.abs, "sign": np.sign
+}  # fmt: skip
 DAY = 86_400.0
 # Period [s] and its harmonics; a Monday that all of them are counted from.
 CALENDAR = ((DAY, 4), (7.0 * DAY, 3), (365.25 * DAY, 2))
@@ -66,7 +68,7 @@ def library(
         lagged("output nonlinearity", form(y), range(1))
         lagged("nonlinear feedback", form(y), range(1, CURVED + 1))
     for name, x in extra.items():
-        known = pd.Series(x).ffill().bfill().fillna(0.0).to_numpy()
+        known = np.asarray(pd.Series(x).ffill().bfill().fillna(0.0), dtype=np.float64)
         lagged("extra input", known, range(LINEAR + 1), name)
     count = np.arange(n, dtype=float)
     found.append((("drift", None), count))

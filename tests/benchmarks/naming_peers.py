@@ -58,7 +58,7 @@ def cross_correlations(e: Array, u: Array, lags: int = LAGS) -> Array:
     if size <= 0.0:
         return np.zeros(2 * lags + 1)
     n = len(e)
-    both = autocorrelations(e, lags) @ autocorrelations(u, lags) / n
+    both = float(autocorrelations(e, lags) @ autocorrelations(u, lags)) / n
     variance = max(1.0 + 2.0 * both, LEAST_VARIANCE)
     later = [float(e[k:] @ u[: n - k]) for k in range(lags + 1)]
     sooner = [float(e[: n - k] @ u[k:]) for k in range(lags, 0, -1)]

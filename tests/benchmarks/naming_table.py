@@ -19,6 +19,12 @@ STRENGTHS = ("weak", "middle", "strong", "none")
 PLANTED_GROUPS = ("single", "two", "three")
 # RMSE after over that before, on the last block, above which a loop did harm.
 HARM = 1.05
+PEERS = (
+    "Bands ask for a noise model (counted as process noise), a plant model (unmodelled dynamics) "
+    "or say feedback; indicators find steps (level shift) and outliers (heavy tails). They have no "
+    "words for other effects: that they say anything is what to compare there. Indicators at "
+    "1 / n keep one impulse of white noise by chance."
+)
 
 
 def names_of(row: Row) -> list[tuple[str, str | None]]:
@@ -103,11 +109,11 @@ def tables(rows: Sequence[Row]) -> str:
         f"{len(rows) - len(made)} more could not be made. {sentence(made)}",
         "### Nothing planted", _gauge_table(ours),
         "### One effect: how often it is named", _potency_table(ours),
-        "### Several effects at once", _set_table(several),
+        "### All effects of a machine", _set_table(several),
         "### Errors on the last block, and time", _error_table(done),
         "### Outside the catalogue", _outside_table(done),
         "### Cost of search", _search_table(made),
-        "### Other tools on the same residuals", _peer_table(done),
+        "### Other tools on the same residuals", PEERS, _peer_table(done),
         "### Superfluous names", _wrong_table(done),
     ]  # fmt: skip
     reasons = Counter(str(row["error"]) for row in made if "error" in row)
@@ -196,7 +202,7 @@ def headline_names_harm(row: Row) -> bool:
 
 
 def _error_table(rows: Sequence[Row]) -> str:
-    head = ["cases", "", "after > 1.05 before", "of those in the headline", "before / floor",
+    head = ["planted", "cases", "after > 1.05 before", "of those in the headline", "before / floor",
             "90th percentile", "after / floor", "90th percentile", "95 % bands hold, after",
             "fit [s]", "90th percentile", "loop [s]", "90th percentile"]  # fmt: skip
     lines = []

@@ -184,11 +184,11 @@ def test_choices_from_words():
     assert [case.seed for case in sorted(cases_of(choice), key=lambda c: c.seed)] == list(
         range(2 * NULLS, 4 * NULLS)
     )
-    assert list(choice_of(seeds="7").seeds) == [7]
+    assert list(choice_of({"seeds": "7"}).seeds) == [7]
     with pytest.raises(ValueError, match=r"seeds: expected '3' or '0-4', got '3-1'"):
-        choice_of(seeds="3-1")
+        choice_of({"seeds": "3-1"})
     with pytest.raises(ValueError, match=r"kinds: expected some of .* got \['no machine'\]"):
-        choice_of(kinds="no machine")
+        choice_of({"kinds": "no machine"})
 
 
 def test_an_interrupted_study_goes_on(tmp_path, monkeypatch):
