@@ -12,6 +12,7 @@ from pyro_dynogp.data.channels import count_direct
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.models.delays import longest_delay, unknown_beginning
 from pyro_dynogp.models.limits import at_limits
+from pyro_dynogp.prediction.predict import runs_after
 from pyro_dynogp.statistics.evidence import Residuals
 from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.support.errors import invalid
@@ -30,10 +31,12 @@ def residuals_of(
     seed: int = 0,
     settings: LoopSettings,
 ) -> Residuals:
-    """Simulation residuals and innovations of one output, in the units of the record.
+    """Free-run residuals and innovations of one output, in the units of the record.
 
-    The output counts as missing until the model knows its inputs, until the simulation, whose first
-    state is unknown, has settled, and where it is exactly at a limit that the model knows.
+    The output counts as missing until the model knows its inputs, until a simulation whose first
+    state is unknown would have settled, and where it is exactly at a limit that the model knows.
+    The free run begins then, with the state that the filter has found in the outputs before: slow
+    poles, and several alike, remember for longer.
 
     Args:
         fit: the fit. record: along which, in one piece.
@@ -51,17 +54,16 @@ def residuals_of(
             )
     prepared = fit.model.check(record)[0]
     spread = fit if fit.method != "map" else _spread(fit, settings.draws, seed)
-    options = {} if fit.model.is_linear else {"process_noise": False}
-    mean = fit.simulate(prepared, seed=seed, **options).mean[:, output]
-    component = spread.simulate(
-        prepared, seed=seed, samples=settings.draws, **options
-    ).component_mean
-    chosen = np.linspace(0, len(component) - 1, min(settings.draws, len(component))).astype(int)
-    deviations = component[chosen][:, :, output]
     driving = prepared.n_inputs - count_direct(fit.model.channels)
     y = record.outputs[:, output].copy()
     unknown = unknown_beginning(record, longest_delay(fit.model))
-    y[: unknown + settling(fit, record, settings)] = np.nan
+    begin = unknown + settling(fit, record, settings)
+    y[:begin] = np.nan
+    mean, component = (
+        x[..., output] for x in _free_run(fit, spread, prepared, begin, settings.draws, seed)
+    )
+    chosen = np.linspace(0, len(component) - 1, min(settings.draws, len(component))).astype(int)
+    deviations = component[chosen]
     innovations = fit.innovations(prepared)[:, output]
     # A sensor at its limit says nothing of the error there.
     stopped = at_limits(fit.model.layers, prepared)
@@ -83,6 +85,27 @@ def residuals_of(
         step=record.sampling_time,
         stamps=record.timestamps,
     )
+
+
+def _free_run(
+    fit: Fit, spread: Fit, record: Record, begin: int, count: int, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (n, n_y) of a free run from sample `begin` on, and draws of it (S, n, n_y).
+
+    Before, and along all of a record without outputs there, from an unknown first state.
+    """
+    noisy = fit.model.is_linear
+    mean = fit.simulate(record, process_noise=noisy, seed=seed).mean
+    component = spread.simulate(
+        record, process_noise=noisy, samples=count, seed=seed
+    ).component_mean
+    if np.isfinite(record.outputs[:begin]).any() and poles_of(fit).size:
+        past, rest = record[:begin], record[begin:]
+        mean[begin:] = fit.forecast(past, rest, process_noise=noisy, seed=seed).mean
+        runs = runs_after(spread, past, rest, samples=count, seed=seed)
+        few = min(len(component), len(runs))
+        component = np.concatenate([component[:few, :begin], runs[:few]], axis=1)
+    return mean, component
 
 
 def _spread(fit: Fit, count: int, seed: int) -> Fit:

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 FED_BACK = "inputs are under feedback, for which the residual speaks more clearly"
 OTHERS = "others are more probable, or no block of the model stands for it"
 ANY = "any structure"
+# In `where` of evidence of an input that is computed from the output: the channel it is set by.
+SET = "set point"
+SET_POINT = "it is the set point of a controller, and acts through the input alone"
 OVER = "the most effects that may be added are added"
 
 
@@ -198,19 +201,25 @@ class SearchState:
         Inputs that follow the output's disturbances are among what explains the residual, whatever
         the model is. (What a model lacks may look like feedback, but less than like itself.)
         """
-        certain = [f.evidence.p_value for f in self.reported]
+        certain = [f.evidence.p_value for f in self.reported if SET not in f.evidence.where]
         return (
             bool(certain)
             and found.effect.mimicked_by_feedback
             and found.evidence.p_value > min(certain)
         )
 
+    def _is_set_point(self, found: Found) -> bool:
+        """Whether an effect comes from the set point of a controller that computes an input."""
+        where = found.evidence.where
+        points = {f.evidence.where[SET] for f in self.reported if SET in f.evidence.where}
+        return SET not in where and where.get("channel") in points
+
     def _chosen(self, looked: Tested) -> list[Candidate]:
         """Effects that are worth a refit, where anything is left."""
         rounds = self.rounds
         if not self.left:
             return []
-        open_loop = [f for f in looked.found if not self._is_fed_back(f)]
+        open_loop = [f for f in looked.found if not (self._is_fed_back(f) or self._is_set_point(f))]
         return candidates_of(
             open_loop, self.model, rounds.data.known, rounds.level, rounds.tries, rounds.settings
         )
@@ -250,6 +259,8 @@ class SearchState:
             attempt = Attempt(self.number, f.evidence, f.q_value, "not tried", refused or why)
             if not f.effect.added:
                 attempt = replace(attempt, decision="reported", reason="is reported, not added")
+            elif self._is_set_point(f):
+                attempt = replace(attempt, reason=SET_POINT)
             elif self._is_fed_back(f):
                 attempt = replace(attempt, reason=FED_BACK)
             attempts.append(attempt)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from pyro_dynogp.effects.base import Effect
 from pyro_dynogp.models.variants import Model
 from pyro_dynogp.statistics.autoregression import Whitener, fitted_filter
 from pyro_dynogp.statistics.bootstrap import Noise, standardised_gains, tail_probability
+from pyro_dynogp.statistics.controllers import controller_of
 from pyro_dynogp.statistics.detecting import looked
 from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
 from pyro_dynogp.statistics.prewhitening import Projection, log_ratio, spanning
@@ -20,6 +22,8 @@ from pyro_dynogp.statistics.shares_of_inputs import input_columns
 
 # Of future inputs: a controller answers within as many samples.
 AHEAD = (1, 2, 4, 8, 16)
+# p-value of an exact relation, which no chance makes.
+CERTAIN = 1e-300
 
 
 def feedback(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> list[Evidence]:
@@ -28,11 +32,15 @@ def feedback(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> 
     The whitened residual, less what past inputs explain, against the next values of each input,
     less what its own past foretells; no causal effect of the input on the output does that. What
     they share at the same instant may be a direct path and does not count: a controller that
-    answers within the sample is seen only as far as it goes on answering.
+    answers within the sample is seen only as far as it goes on answering. An input that is computed
+    from the output to the last digits, with or without a recorded set point, is under feedback
+    whatever the residual is; see `statistics.controllers`.
 
     Returns:
-        One for each input that varies. where: channel. size: part of the one-step error that the
-        input repeats [output]. gain is of the input's future in the residual [nats].
+        One for each input that varies, and first one for each input that is computed, with the
+        `where` of its set point ("" for none that is recorded). where: channel. size: part of the
+        one-step error that the input repeats [output]. gain is of the input's future in the
+        residual [nats].
 
     Source: cross-correlation at negative lags (Ljung, System Identification, 2nd ed., 16.6), both
     sides whitened (Haugh, JASA 71(354):378, 1976); largest over windows, null by resampling.
@@ -40,7 +48,30 @@ def feedback(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> 
     r = residuals
     whiten = fitted_filter(looked(r), settings)
     inputs = [(name, held(u)) for name, u in zip(r.input_names, r.inputs.T, strict=True)]
-    return [_followed(r, whiten, name, u, settings, seed) for name, u in inputs if np.std(u) > 0]
+    varied = [(name, u) for name, u in inputs if np.std(u) > 0]
+    followed = [_followed(r, whiten, name, u, settings, seed) for name, u in varied]
+    computed = (
+        _computed(r, one, u, settings) for one, (_, u) in zip(followed, varied, strict=True)
+    )
+    return [*(one for one in computed if one is not None), *followed]
+
+
+def _computed(
+    r: Residuals, followed: Evidence, u: np.ndarray, settings: LoopSettings
+) -> Evidence | None:
+    """Evidence that an input u (n,) is computed from the output; None where it is not."""
+    controller = controller_of(u, r.output, r.candidates)
+    if controller is None or controller.share >= settings.controller:
+        return None
+    name, sources = followed.where["channel"], [r.output_name]
+    sources += [controller.set_point] if controller.set_point else []
+    names = " and ".join(repr(one) for one in sources)
+    return replace(
+        followed,
+        p_value=CERTAIN,
+        where={"channel": name, "set point": controller.set_point},
+        sentence=f"Input {name!r} is computed from {names}: it is under feedback.",
+    )
 
 
 def _followed(

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.models.draws import variance_multiples
+from pyro_dynogp.models.draws import JointState, variance_multiples
 from pyro_dynogp.models.exact_outputs import ExactOutputs, spread_evenly
 from pyro_dynogp.models.late_systems import arrive
 from pyro_dynogp.models.output_process import OutputProcess, flat
@@ -65,6 +65,33 @@ def forecast(
         inputs = torch.cat([before.scaled_inputs, outputs.scaled_inputs], -2)
         outputs.noise_sd = before.system.noise_sd(inputs, time)[..., len(past) :, :]
         return _forward(fit, later, outputs, samples, seed, "forecast")
+
+
+def runs_after(
+    fit: Fitted, past: Record, future: Record, samples: int = 200, seed: int = 0
+) -> np.ndarray:
+    """Outputs (S, n, n_y) without any noise, one for each draw of parameters and of the state.
+
+    The state is drawn given the past. There is one draw of it, and of functions, for each draw of a
+    linear model's parameters, and at least `samples` of other models.
+
+    Args:
+        fit: the fit. past, future: as for `Fit.forecast`. samples, seed: of the draws.
+    """
+    if not fit.model.is_linear:
+        found = forecast(fit, past, future, process_noise=False, samples=samples, seed=seed)
+        return found.component_mean
+    earlier, later, gap = following(fit, past, future)
+    with_outputs([earlier], "past")
+    with torch.no_grad(), seeded(seed):
+        before = output_process(beginning(fit, earlier, predicting=True), earlier)
+        next_inputs = arrive(fit.system, later).inputs[..., 0, :]
+        given = before.state_after(earlier.observations, gap, next_inputs, process_noise=False)
+        random = torch.randn(given.mean.shape, dtype=torch.float64)
+        state = given.mean + (given.root() @ random.unsqueeze(-1)).squeeze(-1)
+        start = JointState(state, torch.zeros_like(given.covariance))
+        outputs = output_process(fit.system.without_process_noise, later, start=start)
+        return outputs.components(samples=1, seed=seed).mean
 
 
 def _forward(

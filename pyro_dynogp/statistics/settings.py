@@ -94,6 +94,10 @@ class LoopSettings:
             Evidence: reason: what is slower is drift.
         harmonic: level of the test of each harmonic, all together. Evidence: convention.
         outlier: probability that normal errors have an outlier anywhere. Evidence: convention.
+        controller: share of an input's variance, less what its past and a set point foretell, below
+            which it is computed from the output. Evidence: 300 records without feedback, with 1 %
+            noise and three of four with a direct path, have 1.3e-4 or more; PI and PID controllers
+            1e-12 or less, with three decimals 1e-6 (tests).
 
     Raises:
         ValueError: on a number that is not positive.
@@ -143,6 +147,7 @@ class LoopSettings:
     cycles: float = 3.0
     harmonic: float = 0.01
     outlier: float = 0.05
+    controller: float = 1e-5
 
     def __post_init__(self) -> None:
         for entry in fields(self):

@@ -15,7 +15,7 @@ from pyro_dynogp.data.channels import DeadZone
 from pyro_dynogp.discrepancy.context import SearchContext
 from pyro_dynogp.discrepancy.held_out import certain, without
 from pyro_dynogp.discrepancy.search import Found, candidates_of, extended_by, look, rated
-from pyro_dynogp.discrepancy.state import SearchState
+from pyro_dynogp.discrepancy.state import SET_POINT, SearchState
 from pyro_dynogp.effects import Effect
 from pyro_dynogp.models.variants import with_channel
 from pyro_dynogp.statistics import omnibus
@@ -146,6 +146,30 @@ def test_what_inputs_under_feedback_may_imitate_is_not_tried_where_feedback_is_m
     assert not state._is_fed_back(weaker)
 
 
+def test_a_set_point_is_not_tried_and_other_effects_are(state):
+    """An exact relation says nothing of how certain what follows the noise is."""
+
+    def found(effect, p, **where):
+        one, evidence = speaking(effect, p)
+        return Found(one, replace(evidence, where={**evidence.where, **where}), p)
+
+    state.reported = [found(effects.Feedback(), 1e-300, channel="u", **{"set point": "r"})]
+    way = {"form": "linear", "delay": 0.0}
+    own = found(effects.ExtraInput(), 1e-300, channel="r", **way)
+    other = found(effects.ExtraInput(), 1e-5, channel="w", **way)
+    assert [state._is_set_point(one) for one in (own, other, *state.reported)] == [
+        True,
+        False,
+        False,
+    ]
+    assert not any(state._is_fed_back(one) for one in (own, other))
+    state.left = ("something",)
+    attempts = {one.channel: one.reason for one in state._untried([own, other], [], "others")}
+    assert attempts == {"r": SET_POINT, "w": "others"}
+    state.reported, state.left = [], ()
+    assert not state._is_set_point(own)
+
+
 def test_two_answers_to_whether_anything_is_left_share_the_level(state):
     context = state.rounds
     assert context.gate == pytest.approx(0.025)
@@ -263,6 +287,7 @@ def test_an_effect_that_the_model_cannot_have_is_no_candidate_and_says_why():
     assert extended_by(fine, model, record) == ([model], "")
     data = SimpleNamespace(known=record)
     course = SimpleNamespace(
+        _is_set_point=lambda found: False,
         number=2, model=model, rounds=SimpleNamespace(level=0.05, data=data),
         _is_fed_back=lambda found: False,
     )  # fmt: skip
