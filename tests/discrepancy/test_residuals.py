@@ -70,7 +70,7 @@ def left_alone(n, noise=0.01):
     u = 0.1 * np.repeat(rng.standard_normal(n // 5), 5)
     step = [0.0, 1.0 - 1.2 * np.exp(-0.2), np.exp(-0.4) - 0.8 * np.exp(-0.2)]  # (1 + s)^-2, held
     driven = lfilter(step, [1.0, -2.0 * np.exp(-0.2), np.exp(-0.4)], u)
-    y = driven + (20.0 + 60.0 * t) * np.exp(-t) + noise * rng.standard_normal(n)
+    y = driven + (3.0 + 9.0 * t) * np.exp(-t) + noise * rng.standard_normal(n)
     return dgp.Record(t, u[:, None], y[:, None])
 
 
@@ -85,10 +85,11 @@ def test_free_runs_begin_where_the_filter_is():
     assert np.isnan(found.residual[:begin]).all()
     assert np.abs(found.residual[soon]).max() < 0.05
     from_rest = record.outputs[:, 0] - fit.simulate(record, seed=0).mean[:, 0]
-    assert np.abs(from_rest[soon]).min() > 0.05
-    # They are as uncertain as the state is there, and that is forgotten.
+    assert np.abs(from_rest[soon]).max() > 0.2
+    # They are uncertain by the state there, and that is forgotten.
     spread = found.deviations.std(0)
-    assert 0.002 < spread[soon].mean() < 0.03
+    assert spread[soon].mean() > 0.002
+    assert spread[-8:].mean() < 0.1 * spread[soon].mean()
 
 
 def test_draws_of_free_runs_have_the_moments_of_the_forecast(modes):
