@@ -98,6 +98,22 @@ def put(typing: Any, array: Any, k: Any, x: Any) -> Any:
 
 
 @intrinsic
+def gather(typing: Any, array: Any, index: Any) -> Any:
+    """Numbers of a contiguous float64 array, counted through all axes; index: whole numbers."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        places = builder.fptosi(args[1], WHOLE)
+        found = ir.Constant(VECTOR, ir.Undefined)
+        for k in range(WIDTH):
+            place = builder.gep(data, [builder.extract_element(places, _index(k))])
+            found = builder.insert_element(found, builder.load(place), _index(k))
+        return found
+
+    return LANES(array, LANES), lower
+
+
+@intrinsic
 def splat(typing: Any, x: Any) -> Any:
     """The same number in every lane."""
 

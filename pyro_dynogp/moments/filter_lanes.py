@@ -62,8 +62,7 @@ class Room(NamedTuple):
     """Work arrays of lanes.
 
     m (A), P (A A), T (N A), c (A); of one static layer centre (d), W (A d), own covariance (d d)
-    and its root (d d), a node (d), f (Q e), cross and gain (d e); of a table the first of four grid
-    points and the place behind the second (2), and four values (4).
+    and its root (d d), a node (d), f (Q e), cross and gain (d e).
     """
 
     m: np.ndarray
@@ -78,8 +77,6 @@ class Room(NamedTuple):
     f: np.ndarray
     cross: np.ndarray
     gain: np.ndarray
-    place: np.ndarray
-    corner: np.ndarray
 
 
 def room(states: int, outputs: int, channels: int, widest: int, nodes: int) -> Room:
@@ -90,7 +87,7 @@ def room(states: int, outputs: int, channels: int, widest: int, nodes: int) -> R
             one of them. nodes: most nodes.
     """
     A, d, e = states + outputs, channels, widest
-    sizes = (A, A * A, states * A, A, d, A * d, d * d, d * d, d, nodes * e, d * e, d * e, 2, 4)
+    sizes = (A, A * A, states * A, A, d, A * d, d * d, d * d, d, nodes * e, d * e, d * e)
     return Room(*(np.zeros((max(size, 1), WIDTH)) for size in sizes))
 
 
@@ -211,12 +208,12 @@ def _average(i, layout, A, values, own):
         if layout.form[i] == TABLE:
             low = get(values.low, i)
             scale = splat(1.0) / get(values.spacing, i)
-            locate((get(own.z, 0) - low) * scale, values.table_mean.shape[2], own.place)
+            first, u = locate((get(own.z, 0) - low) * scale, values.table_mean.shape[2])
             for a in range(e):
-                put(own.f, q * e + a, cubic(values.table_mean, f0 + a, own.place, own.corner))
+                put(own.f, q * e + a, cubic(values.table_mean, f0 + a, first, u))
                 if values.varies[f0 + a]:
                     at = (na + a) * A + na + a
-                    more = cubic(values.table_variance, f0 + a, own.place, own.corner)
+                    more = cubic(values.table_variance, f0 + a, first, u)
                     put(own.P, at, get(own.P, at) + weight * more)
         else:
             expand(layout.form[i], i, d, e, f0, q * e, values, own.z, own.f)

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit
 
-from pyro_dynogp.lti.lanes import WIDTH, below, choose, exponential, get, put, root, splat
+from pyro_dynogp.lti.lanes import WIDTH, below, choose, exponential, gather, get, put, root, splat
 from pyro_dynogp.support.compiled import BORROWING, WITHIN
+
+# Number of each point.
+PLACES = np.arange(float(WIDTH))
 
 
 @njit(**WITHIN)
-def locate(t, count, place):
-    """Write where t, in spacings from the first point of a grid, lies, as `functions.place`.
+def locate(t, count):
+    """Where t, in spacings from the first point of a grid, lies, as `functions.place`.
 
     The first of four grid points, and how far behind the second.
     """
@@ -21,22 +25,19 @@ def locate(t, count, place):
     t = choose(t - end, end, choose(t - one, t, one))
     first = below(t)
     first = choose(first - splat(count - 3.0), splat(count - 3.0), first)
-    put(place, 0, first - one)
-    put(place, 1, t - first)
+    return first - one, t - first
 
 
 @njit(**WITHIN)
-def cubic(table, f, place, corner):
+def cubic(table, f, first, u):
     """Values of function f of each point's table (WIDTH, E, grid), as `functions.between`."""
-    for lane in range(WIDTH):
-        k = int(place[0, lane])
-        for b in range(4):
-            corner[b, lane] = table[lane, f, k + b]
-    u = get(place, 1)
-    a = get(corner, 0)
-    b = get(corner, 1)
-    c = get(corner, 2)
-    d = get(corner, 3)
+    E, grid = table.shape[1], table.shape[2]
+    one = splat(1.0)
+    at = get(PLACES, 0) * splat(float(E * grid)) + splat(float(f * grid)) + first
+    a = gather(table, at)
+    b = gather(table, at + one)
+    c = gather(table, at + one + one)
+    d = gather(table, at + one + one + one)
     half = splat(0.5)
     square = a - splat(2.5) * b + splat(2.0) * c - half * d
     cube = splat(1.5) * (b - c) + half * (d - a)
