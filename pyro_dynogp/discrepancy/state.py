@@ -192,7 +192,10 @@ class SearchState:
         elif self.accepted:
             done = "The search without it found nothing to add, and began again with it."
         else:
-            done = "Neither without it nor with it did the search find anything to add."
+            done = (
+                "Neither without it nor with it did the search find anything to add: fit it with "
+                "process_noise=False."
+            )
         return [f"The model as given {self.hidden}: such noise can hide what is missing. {done}"]
 
     def _is_fed_back(self, found: Found) -> bool:

@@ -52,6 +52,9 @@ FRESH, FRESH_STEPS = 4, 40
 # few iterations their order says little (of nine plants two chose a start 180 nats below another).
 AGAIN = Effort(kept=1.0, rate=0.004, near=True)
 EXTENDED, LOOPED = Effort(kept=1 / 2, together=8), Effort(kept=1.0, together=8)
+# Samples from which what is new in feedback is looked for along an excerpt first, and its length:
+# an iteration goes through the filter once for each of some hundred numbers.
+LONG, EXCERPT = 1_600, 1_000
 # Iterations of all variants of an effect, by Gauss-Newton and of others, and more of the leading
 # ones: this share, three at least.
 FIRST_STEPS, MORE_STEPS = (2, 8), (12, 32)
@@ -188,6 +191,24 @@ def _settled(problem: Problem, optima: list[Optimum], run: Run) -> list[Optimum]
 
 
 def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
+    """Optima of a model that extends that of a fit, on long records with feedback from an excerpt.
+
+    What is new is found along the excerpt, and goes on along the whole.
+    """
+    target = problem.target
+    new = target.has_feedback and not have_same_parameters(target, fit.model)
+    excerpt = problem.beginning(LONG, EXCERPT) if new and not run.steps else None
+    if excerpt is None:
+        return _settled(problem, _climbed(fit, problem, run), run)
+    (best, *_) = _climbed(fit, excerpt, run)
+    optima = maximise(
+        target, problem.records, [best.values], run, optimizer=optimizer_near(target),
+        steps=LAYERED_STEPS, effort=AGAIN, held=_held(target),
+    )  # fmt: skip
+    return _settled(problem, optima, run)
+
+
+def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     """Optima of a model that extends that of a fit.
 
     With a layer more Adam climbs, as in a first fit: better optimisers get to modes of a free
@@ -225,18 +246,17 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
         if not (run.steps or (target.has_feedback and fit.model.is_linear)):
             starts += starting_points(target, records, run, count=FRESH, steps=FRESH_STEPS)
         optimizer = optimizer_for(target)
-        optima = climb(target, records, starts, [], run, optimizer=optimizer, effort=effort,
-                       steps=run.steps or ADDED_STEPS[optimizer])  # fmt: skip
-        return _settled(problem, optima, run)
+        return climb(target, records, starts, [], run, optimizer=optimizer, effort=effort,
+                     steps=run.steps or ADDED_STEPS[optimizer])  # fmt: skip
     if run.steps:  # a few, to compare variants
         starts = [most_probable(problem, starts)]
     if have_same_parameters(target, fit.model):  # nothing is new
-        return _settled(problem, climbed(target, starts[:1], LAYERED_STEPS), run)
+        return climbed(target, starts[:1], LAYERED_STEPS)
     quiet = without_noise_below_functions(target)
     if quiet != target:
         best = climbed(quiet, [louder(start) for start in starts], LAYERED_STEPS)[0]
         starts = [*starts, grown(best.values, new)]
-    return _settled(problem, climbed(target, starts, LAYERED_STEPS), run)
+    return climbed(target, starts, LAYERED_STEPS)
 
 
 def _posterior(

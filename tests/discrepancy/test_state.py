@@ -212,7 +212,7 @@ def test_what_goes_with_inputs_under_feedback_is_not_tried(effect, p, certain, f
         ((True, False), True, False, "the extended model does without it"),
         ((True, True), True, False, "the extended model has it again"),
         ((True, True), True, True, "found nothing to add, and began again with it"),
-        ((True, True), False, True, "Neither without it nor with it"),
+        ((True, True), False, True, "to add: fit it with process_noise=False"),
         ((True, False), False, False, "Without it nothing is missing"),
         ((False, False), True, False, "Fit it with process_noise=False"),  # in some layers only
     ],

@@ -12,7 +12,9 @@ from pyro_dynogp.inference import refit as refits
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.refit import optima_of, refit
 from pyro_dynogp.inference.run import Run
+from pyro_dynogp.models.variants import with_feedback
 from tests.inference.cascades import FAST, wiener
+from tests.models.closed_loops import make_record
 
 
 def test_on_the_same_data_a_mode_stays(map_fit):
@@ -85,3 +87,30 @@ def test_races_count_the_steps_of_the_optimizer_that_runs(monkeypatch, model, st
     monkeypatch.setattr(refits, "refit", again)
     refits.race(SimpleNamespace(model=model), [model] * 4, None, Run(0))
     assert given == steps
+
+
+@pytest.mark.parametrize("long", [60, 200])
+def test_what_is_new_in_feedback_is_looked_for_along_an_excerpt_of_long_records(monkeypatch, long):
+    """Then the best optimum goes on along the whole; short records are climbed as they are."""
+    monkeypatch.setattr(refits, "LONG", long)
+    monkeypatch.setattr(refits, "EXCERPT", 40)
+    record, model = make_record(n=80, missing=False), dgp.LinearDynamicGP(1, pairs=1)
+    fit = dgp.fit(model, record, method="map", restarts=1, workers=1, progress=False)
+    climbs = []
+    for name in ("climb", "maximise"):
+        climbed = getattr(refits, name)
+
+        def watched(model, records, starts, *rest, climbed=climbed, **options):
+            climbs.append((len(records[0]), len(starts)))
+            return climbed(model, records, starts, *rest, **options | {"steps": 2})
+
+        monkeypatch.setattr(refits, name, watched)
+    monkeypatch.setattr(refits, "kernels_by_evidence", lambda model, records, optima, run: optima)
+    again = refit(fit, record, model=with_feedback(model, output=False, hidden=True))
+    several = climbs[0][1]
+    assert several > 1
+    assert climbs == ([(40, several), (80, 1)] if long == 60 else [(80, several)])
+    assert len(again.records[0]) == 80
+    climbs.clear()
+    refit(again, record, model=again.model)  # nothing is new
+    assert climbs == [(80, 1)]

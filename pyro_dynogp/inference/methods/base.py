@@ -80,9 +80,13 @@ class Problem:
         So it is with several records, with values that are learnt from another fit, and where an
         input or output hardly moves in that part.
         """
-        if self.learnt is not None or len(self.records) > 1 or len(self.records[0]) < LONG:
+        return None if self.learnt is not None else self.beginning(LONG, EXCERPT)
+
+    def beginning(self, long: int, length: int) -> Problem | None:
+        """The same of the first samples of a record that has `long` or more; None as above."""
+        if len(self.records) > 1 or len(self.records[0]) < long:
             return None
-        part = self.records[0].head(EXCERPT)
+        part = self.records[0].head(length)
         few, whole = _variances(part), _variances(self.records[0])
         return replace(self, records=(part,)) if (few >= LIVELY * whole).all() else None
 
