@@ -10,6 +10,7 @@ import numpy as np
 from pyro_dynogp.criticism.posterior_draws import draws_of
 from pyro_dynogp.data.channels import count_direct
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
 from pyro_dynogp.models.delays import longest_delay, unknown_beginning
 from pyro_dynogp.models.limits import at_limits
 from pyro_dynogp.prediction.predict import runs_after
@@ -101,11 +102,30 @@ def _free_run(
     ).component_mean
     if np.isfinite(record.outputs[:begin]).any() and poles_of(fit).size:
         past, rest = record[:begin], record[begin:]
-        mean[begin:] = fit.forecast(past, rest, process_noise=noisy, seed=seed).mean
-        runs = runs_after(spread, past, rest, samples=count, seed=seed)
+        runs = _runs(spread, past, rest, count, seed)
         few = min(len(component), len(runs))
-        component = np.concatenate([component[:few, :begin], runs[:few]], axis=1)
+        if few:
+            mean[begin:] = fit.forecast(past, rest, process_noise=noisy, seed=seed).mean
+            component = np.concatenate([component[:few, :begin], runs[:few]], axis=1)
     return mean, component
+
+
+def _runs(spread: Fit, past: Record, rest: Record, count: int, seed: int) -> np.ndarray:
+    """Draws of a free run (S, n, n_y), of those parameter draws at which the filter can be run.
+
+    A draw may have a first state so uncertain that nothing of the noise is left of its variance.
+    """
+    try:
+        return runs_after(spread, past, rest, samples=count, seed=seed)
+    except NotPositiveDefiniteError:
+        if spread.n_draws == 1:
+            return np.empty((0, len(rest), rest.n_outputs))
+    draws = spread.draws
+    halves = [
+        spread.with_draws({name: x.tensor_split(2)[half] for name, x in draws.items()})
+        for half in (0, 1)
+    ]
+    return np.concatenate([_runs(half, past, rest, count, seed) for half in halves])
 
 
 def _spread(fit: Fit, count: int, seed: int) -> Fit:

@@ -12,6 +12,7 @@ from pyro_dynogp.inference.methods.mode import at_optimum
 from pyro_dynogp.inference.optimise.maximum import maximise
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.plans import starting_points
+from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
 from pyro_dynogp.prediction.predict import runs_after
 from pyro_dynogp.statistics.settings import LoopSettings
 from tests.prediction.test_feedback import rubbed
@@ -117,3 +118,27 @@ def test_without_outputs_at_the_beginning_the_first_state_is_unknown():
     unseen = record.with_outputs(y)
     found = residuals.residuals_of(fit, unseen, settings=settings)
     np.testing.assert_array_equal(found.mean, fit.simulate(unseen, seed=fit.seed).mean[:, 0])
+
+
+def test_parameter_draws_at_which_the_filter_fails_are_left_out(modes, monkeypatch):
+    """The others are as they are by themselves; without any the first state is unknown."""
+    record, fits = modes
+    fit = fits["linear"]
+    one = {name: x.unsqueeze(0).expand(6, *x.shape).clone() for name, x in fit.mode.items()}
+    one["noise_sd"] = torch.full_like(one["noise_sd"], 0.1)
+    one["noise_sd"][[1, 4]] = 1e-12
+    spread = fit.with_draws(one)
+    past, rest = record[:12], record[12:]
+
+    def fails(some, *records, **options):
+        if bool((some.draws["noise_sd"] < 1e-9).any()):
+            raise NotPositiveDefiniteError
+        return runs_after(some, *records, **options)
+
+    monkeypatch.setattr(residuals, "runs_after", fails)
+    runs = residuals._runs(spread, past, rest, 6, 0)
+    assert runs.shape == (4, len(rest), 1)
+    none = fit.with_draws({name: x[[1, 4]] for name, x in one.items()})
+    assert len(residuals._runs(none, past, rest, 6, 0)) == 0
+    _, component = residuals._free_run(fit, none, record, 12, 6, 0)
+    np.testing.assert_array_equal(component, none.simulate(record, seed=0).component_mean)
