@@ -14,6 +14,7 @@ from pyro_dynogp.discrepancy.result import Attempt, EffectTest, Outcome
 from pyro_dynogp.discrepancy.search import Candidate, Found, candidates_of, extended_by
 from pyro_dynogp.effects.base import OUTSIDE
 from pyro_dynogp.models.variants import Model, has_process_noise
+from pyro_dynogp.statistics.controllers import SET
 from pyro_dynogp.statistics.evidence import Residuals
 from pyro_dynogp.statistics.settings import LoopSettings
 
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
 FED_BACK = "inputs are under feedback, for which the residual speaks more clearly"
 OTHERS = "others are more probable, or no block of the model stands for it"
 ANY = "any structure"
-# In `where` of evidence of an input that is computed from the output: the channel it is set by.
-SET = "set point"
 SET_POINT = "it is the set point of a controller, and acts through the input alone"
 OVER = "the most effects that may be added are added"
 

@@ -13,7 +13,7 @@ from pyro_dynogp.effects.base import Effect
 from pyro_dynogp.models.variants import Model
 from pyro_dynogp.statistics.autoregression import Whitener, fitted_filter
 from pyro_dynogp.statistics.bootstrap import Noise, standardised_gains, tail_probability
-from pyro_dynogp.statistics.controllers import controller_of
+from pyro_dynogp.statistics.controllers import SET, controller_of
 from pyro_dynogp.statistics.detecting import looked
 from pyro_dynogp.statistics.evidence import Curve, Evidence, Residuals
 from pyro_dynogp.statistics.prewhitening import Projection, log_ratio, spanning
@@ -69,7 +69,7 @@ def _computed(
     return replace(
         followed,
         p_value=CERTAIN,
-        where={"channel": name, "set point": controller.set_point},
+        where={"channel": name, SET: controller.set_point},
         sentence=f"Input {name!r} is computed from {names}: it is under feedback.",
     )
 

@@ -73,6 +73,10 @@ class JointState:
         """Square root (*b, N, N) of the covariance, singular or not."""
         return root_of(self.covariance)
 
+    def drawn(self, standard: Tensor) -> Tensor:
+        """States (*s, N) that standard normal numbers (*s, N) make."""
+        return self.mean + (self.root() @ standard.unsqueeze(-1)).squeeze(-1)
+
 
 def root_of(covariance: Tensor) -> Tensor:
     """Square root (*b, N, N) of a covariance, singular or not."""
@@ -182,9 +186,7 @@ def draw_layers(
         start: state at the first sample. random: numbers of shape (*shape, ...), which *b
             broadcasts to. switches: which causes act.
     """
-    state = start.mean
-    if switches.initial_state:
-        state = state + (start.root() @ random.state.unsqueeze(-1)).squeeze(-1)
+    state = start.drawn(random.state) if switches.initial_state else start.mean
     lead = random.state.shape[:-1]
     state = state.expand((*lead, state.shape[-1]))
     half = state.shape[-1] // 2

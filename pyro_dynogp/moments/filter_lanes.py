@@ -4,6 +4,9 @@ The recursion of `smoothing.innovate`, operation by operation, for eight points 
 differences over many points (Gauss-Newton, Fisher matrices) and densities of many draws need. Noise
 is Gaussian, and outputs are measured through rows of their own. Only the look-up in tables goes
 point by point.
+
+The numbers of a group of points are `Values` whose arrays are lanes, the last axis being the point:
+all but tables (WIDTH, E, grid), which are looked up point by point, and y, which the points share.
 """
 
 from __future__ import annotations
@@ -21,41 +24,17 @@ from pyro_dynogp.moments.layout import FLOOR
 from pyro_dynogp.support.compiled import BORROWING, WITHIN
 
 
-class LaneValues(NamedTuple):
-    """`Values` of one group of points, as arrays of lanes: the last axis is the point.
+class InUse(NamedTuple):
+    """What is not zero at every point of a group: the rest is passed over.
 
     Attributes:
-        re to slope: as of `Values`, but for `y`, which all points share.
-        table_mean, table_variance: (WIDTH, E, grid), point by point.
-        varies: (E,) whether a function has a variance of its own at any point.
-        seen_inputs: (D, A), seen_outputs: (n_y, A), fed_back: (k, N, E): where G, H and gamma are
-            not zero at every point.
+        variance: (E,) of functions. G: (D, A), H: (n_y, A), gamma: (k, N, E), as of `Values`.
     """
 
-    re: np.ndarray
-    im: np.ndarray
-    Q: np.ndarray
-    gamma: np.ndarray
-    m0: np.ndarray
-    P0: np.ndarray
+    variance: np.ndarray
     G: np.ndarray
-    offset: np.ndarray
-    low: np.ndarray
-    spacing: np.ndarray
-    weight: np.ndarray
-    Z: np.ndarray
-    inverse: np.ndarray
-    constant: np.ndarray
-    slope: np.ndarray
     H: np.ndarray
-    y_offset: np.ndarray
-    R: np.ndarray
-    table_mean: np.ndarray
-    table_variance: np.ndarray
-    varies: np.ndarray
-    seen_inputs: np.ndarray
-    seen_outputs: np.ndarray
-    fed_back: np.ndarray
+    gamma: np.ndarray
 
 
 class Room(NamedTuple):
@@ -92,17 +71,17 @@ def room(states: int, outputs: int, channels: int, widest: int, nodes: int) -> R
 
 
 @njit(**WITHIN)
-def _weighted(row, first, used, x, stride, count):
-    """Sum of row[first + j] x[j stride] over the entries in use."""
+def _weighted(row, first, used, x, start, stride, count):
+    """Sum of row[first + j] x[start + j stride] over the entries j of a row that are in use."""
     total = splat(0.0)
     for j in range(count):
         if used[j]:
-            total = total + get(row, first + j) * get(x, j * stride)
+            total = total + get(row, first + j) * get(x, start + j * stride)
     return total
 
 
 @njit(**WITHIN)
-def _enter(k, N, A, values, own):
+def _enter(k, N, A, values, used, own):
     """Move the state over step k, as `state.move`."""
     P, T, m = own.P, own.T, own.m
     E = A - N
@@ -122,7 +101,7 @@ def _enter(k, N, A, values, own):
         put(m, q, b * x + a * w)
     for j in range(N):
         for f in range(E):
-            if values.fed_back[k, j, f]:
+            if used.gamma[k, j, f]:
                 t = get(values.gamma, (k * N + j) * E + f)
                 for i in range(A):
                     put(T, j * A + i, get(T, j * A + i) + t * get(P, (N + f) * A + i))
@@ -138,40 +117,30 @@ def _enter(k, N, A, values, own):
             put(P, i * A + q, b * x + a * w + get(values.Q, (k * N + i) * N + q))
         for j in range(N):
             for f in range(E):
-                if values.fed_back[k, j, f]:
+                if used.gamma[k, j, f]:
                     t = get(values.gamma, (k * N + j) * E + f)
                     put(P, i * A + j, get(P, i * A + j) + get(T, i * A + N + f) * t)
 
 
 @njit(**WITHIN)
-def _project(i, time, layout, A, values, own):
+def _project(i, time, layout, A, values, used, own):
     """Mean of a layer's input, its covariance W with a, and the root of its own."""
     d = layout.channels[i]
     first = layout.g_start[i]
-    D = values.seen_inputs.shape[0]
+    D = used.G.shape[0]
     na = values.m0.shape[0] + layout.f_start[i]
     for c in range(d):
-        used = values.seen_inputs[first + c]
+        seen = used.G[first + c]
         row = (first + c) * A
         mean = get(values.offset, time * D + first + c)
         for j in range(na):
-            if used[j]:
+            if seen[j]:
                 mean = mean + get(values.G, row + j) * get(own.m, j)
         put(own.centre, c, mean)
         for k in range(na):
-            total = splat(0.0)
-            for j in range(na):
-                if used[j]:
-                    total = total + get(own.P, k * A + j) * get(values.G, row + j)
-            put(own.W, k * d + c, total)
-    for c in range(d):
-        used = values.seen_inputs[first + c]
+            put(own.W, k * d + c, _weighted(values.G, row, seen, own.P, k * A, 1, na))
         for b in range(c + 1):
-            row = (first + c) * A
-            total = splat(0.0)
-            for j in range(na):
-                if used[j]:
-                    total = total + get(values.G, row + j) * get(own.W, j * d + b)
+            total = _weighted(values.G, row, seen, own.W, b, d, na)
             put(own.square, c * d + b, total)
             put(own.square, b * d + c, total)
     for c in range(d):
@@ -186,7 +155,7 @@ def _project(i, time, layout, A, values, own):
 
 
 @njit(**WITHIN)
-def _average(i, layout, A, values, own):
+def _average(i, layout, A, values, used, own):
     """Write E f to m, Var f to P and sum w xi f' of static layer i."""
     d = layout.channels[i]
     e = layout.outputs[i]
@@ -211,7 +180,7 @@ def _average(i, layout, A, values, own):
             first, u = locate((get(own.z, 0) - low) * scale, values.table_mean.shape[2])
             for a in range(e):
                 put(own.f, q * e + a, cubic(values.table_mean, f0 + a, first, u))
-                if values.varies[f0 + a]:
+                if used.variance[f0 + a]:
                     at = (na + a) * A + na + a
                     more = cubic(values.table_variance, f0 + a, first, u)
                     put(own.P, at, get(own.P, at) + weight * more)
@@ -234,13 +203,13 @@ def _average(i, layout, A, values, own):
 
 
 @njit(**WITHIN)
-def _append(i, time, layout, A, values, own):
+def _append(i, time, layout, A, values, used, own):
     """Append the outputs of static layer i to mean and covariance, as `static_layer.append`."""
     d = layout.channels[i]
     e = layout.outputs[i]
     na = values.m0.shape[0] + layout.f_start[i]
-    _project(i, time, layout, A, values, own)
-    _average(i, layout, A, values, own)
+    _project(i, time, layout, A, values, used, own)
+    _average(i, layout, A, values, used, own)
     for a in range(e):
         for c in range(d - 1, -1, -1):
             total = get(own.cross, c * e + a)
@@ -256,19 +225,16 @@ def _append(i, time, layout, A, values, own):
 
 
 @njit(**WITHIN)
-def _measure(time, o, y, A, values, own, found):
+def _measure(time, o, A, values, used, own, found):
     """Use one output; its error and variance go to `found` (2 n n_y)."""
+    y = values.y
     n, n_y = y.shape
-    used = values.seen_outputs[o]
+    seen = used.H[o]
     row = o * A
     for i in range(A):
-        total = splat(0.0)
-        for j in range(A):
-            if used[j]:
-                total = total + get(own.P, j * A + i) * get(values.H, row + j)
-        put(own.c, i, total)
-    p = _weighted(values.H, row, used, own.c, 1, A)
-    mean = _weighted(values.H, row, used, own.m, 1, A)
+        put(own.c, i, _weighted(values.H, row, seen, own.P, i, A, A))
+    p = _weighted(values.H, row, seen, own.c, 0, 1, A)
+    mean = _weighted(values.H, row, seen, own.m, 0, 1, A)
     offset = get(values.y_offset, time * n_y + o)
     variance = p + get(values.R, time * n_y + o)
     put(found, time * n_y + o, splat(y[time, o]) - (mean + offset))
@@ -285,14 +251,14 @@ def _measure(time, o, y, A, values, own, found):
 
 
 @njit(**BORROWING)
-def innovate_lanes(layout, y, values, own, found):
+def innovate_lanes(layout, values, used, own, found):
     """Write innovations and their variances of one group to found (2, n, n_y, WIDTH).
 
-    y: (n, n_y), NaN where missing; nothing is written there.
+    Nothing is written where y is missing.
     """
-    n, n_y = y.shape
+    n, n_y = values.y.shape
     N = values.m0.shape[0]
-    A = values.seen_inputs.shape[1]
+    A = used.H.shape[1]
     for j in range(A * A):
         put(own.P, j, splat(0.0))
     for j in range(A):
@@ -304,9 +270,9 @@ def innovate_lanes(layout, y, values, own, found):
     for time in range(n):
         k = layout.step[time]
         if k >= 0:
-            _enter(k, N, A, values, own)
+            _enter(k, N, A, values, used, own)
         for i in range(layout.channels.shape[0]):
-            _append(i, time, layout, A, values, own)
+            _append(i, time, layout, A, values, used, own)
         for o in range(n_y):
-            if not math.isnan(y[time, o]):
-                _measure(time, o, y, A, values, own, found)
+            if not math.isnan(values.y[time, o]):
+                _measure(time, o, A, values, used, own, found)

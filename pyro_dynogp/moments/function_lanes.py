@@ -29,6 +29,14 @@ def locate(t, count):
 
 
 @njit(**WITHIN)
+def powers(a, b, c, d):
+    """Coefficients of u, u^2 and u^3 of the curve through b and c, between four grid values."""
+    half = splat(0.5)
+    square = a - splat(2.5) * b + splat(2.0) * c - half * d
+    return half * (c - a), square, splat(1.5) * (b - c) + half * (d - a)
+
+
+@njit(**WITHIN)
 def cubic(table, f, first, u):
     """Values of function f of each point's table (WIDTH, E, grid), as `functions.between`."""
     E, grid = table.shape[1], table.shape[2]
@@ -38,10 +46,8 @@ def cubic(table, f, first, u):
     b = gather(table, at + one)
     c = gather(table, at + one + one)
     d = gather(table, at + one + one + one)
-    half = splat(0.5)
-    square = a - splat(2.5) * b + splat(2.0) * c - half * d
-    cube = splat(1.5) * (b - c) + half * (d - a)
-    return b + u * (half * (c - a) + u * (square + u * cube))
+    line, square, cube = powers(a, b, c, d)
+    return b + u * (line + u * (square + u * cube))
 
 
 @njit(**WITHIN)
@@ -64,7 +70,7 @@ def radial(form, square):
 def expand(form, i, d, e, f0, first, values, z, f):
     """Write the outputs of the radial expansion of static layer i at z (d) to f, from `first` on.
 
-    d, e: its channels and outputs. f0: its first output among all. values: `LaneValues`.
+    d, e: its channels and outputs. f0: its first output among all. values: in lanes.
     """
     M, most = values.Z.shape[1], values.Z.shape[2]
     for a in range(e):

@@ -6,13 +6,14 @@ import numpy as np
 
 from pyro_dynogp.lti.lanes import WIDTH
 from pyro_dynogp.lti.primitives import array, flatten_batch
-from pyro_dynogp.moments.filter_lanes import LaneValues, innovate_lanes, room
+from pyro_dynogp.moments.filter_lanes import InUse, innovate_lanes, room
+from pyro_dynogp.moments.layout import Values
 from pyro_dynogp.moments.problem import EVENTS, FilterProblem, each
 
 # Points from which lanes pay: fewer leave most of them empty.
 FEWEST = 3
+# What is no array of lanes: tables are looked up point by point, and all points share y.
 _TABLES = ("table_mean", "table_variance")
-_LANES = tuple(name for name in LaneValues._fields if name in EVENTS and name not in _TABLES)
 
 
 def lanes_serve(problem: FilterProblem) -> bool:
@@ -32,7 +33,7 @@ def innovate_together(problem: FilterProblem) -> tuple[np.ndarray, np.ndarray]:
         AssertionError: where `lanes_serve` does not hold.
     """
     assert lanes_serve(problem)
-    names = [*_LANES, *_TABLES]
+    names = [name for name in Values._fields if name != "y"]
     flat, batch = flatten_batch(
         [getattr(problem, name) for name in names], [EVENTS[name] for name in names]
     )
@@ -48,7 +49,7 @@ def innovate_together(problem: FilterProblem) -> tuple[np.ndarray, np.ndarray]:
         rows = np.minimum(np.arange(g * WIDTH, (g + 1) * WIDTH), count - 1)
         own = room(N, E, channels, widest, layout.nodes.shape[1])
         found = np.full((2, *y.shape, WIDTH), np.nan)
-        innovate_lanes(layout, y, _lane_values(parts, rows), own, found)
+        innovate_lanes(layout, *_lanes(parts, rows, y), own, found)
         return np.moveaxis(found, -1, 0)[: count - g * WIDTH]
 
     found = np.concatenate(each(group, -(-count // WIDTH)))
@@ -56,15 +57,15 @@ def innovate_together(problem: FilterProblem) -> tuple[np.ndarray, np.ndarray]:
     return found[:, 0].reshape(shape), found[:, 1].reshape(shape)
 
 
-def _lane_values(parts: dict[str, np.ndarray], rows: np.ndarray) -> LaneValues:
+def _lanes(parts: dict[str, np.ndarray], rows: np.ndarray, y: np.ndarray) -> tuple[Values, InUse]:
     """Points of one group; those that fill it are its last one again."""
-    lanes = {name: np.ascontiguousarray(np.moveaxis(parts[name][rows], 0, -1)) for name in _LANES}
-    tables = {name: parts[name][rows] for name in _TABLES}
-    return LaneValues(
-        **lanes,
-        **tables,
-        varies=(tables["table_variance"] != 0.0).any((0, 2)),
-        seen_inputs=(lanes["G"] != 0.0).any(-1),
-        seen_outputs=(lanes["H"] != 0.0).any(-1),
-        fed_back=(lanes["gamma"] != 0.0).any(-1),
+    group = {name: x[rows] for name, x in parts.items()}
+    lanes = {
+        name: x if name in _TABLES else np.ascontiguousarray(np.moveaxis(x, 0, -1))
+        for name, x in group.items()
+    }
+    used = InUse(
+        (group["table_variance"] != 0.0).any((0, 2)),
+        *((group[name] != 0.0).any(0) for name in ("G", "H", "gamma")),
     )
+    return Values(**lanes, y=y), used

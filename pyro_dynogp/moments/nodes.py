@@ -10,7 +10,8 @@ import math
 import numpy as np
 from numba import njit
 
-from pyro_dynogp.lti.lanes import WIDTH, below, choose, get, put, splat
+from pyro_dynogp.lti.lanes import WIDTH, choose, get, put, splat
+from pyro_dynogp.moments import function_lanes
 from pyro_dynogp.support.compiled import BORROWING, OPTIONS
 
 # The sum reproduces a Gaussian's density to 1e-7 up to five standard deviations. With this SPREAD
@@ -74,11 +75,9 @@ def locate(low, spacing, count, centre, sd, place):
     for v in range(MORE):
         t = start + splat(stride) * get(PLACES, v)
         inside = choose(t - end, splat(0.0), choose(t - one, one, splat(0.0)))
-        t = choose(t - end, end, choose(t - one, t, one))
-        first = below(t)
-        first = choose(first - splat(count - 3.0), splat(count - 3.0), first)
-        put(place, v, first - one)
-        put(place, MORE + v, t - first)
+        first, u = function_lanes.locate(t, count)
+        put(place, v, first)
+        put(place, MORE + v, u)
         put(place, 2 * MORE + v, inside)
 
 
@@ -105,13 +104,9 @@ def cubic(corner, v, u):
     b = get(corner, MORE + v)
     c = get(corner, 2 * MORE + v)
     d = get(corner, 3 * MORE + v)
-    half = splat(0.5)
-    two = splat(2.0)
-    one = half * (c - a)
-    square = a - splat(2.5) * b + two * c - half * d
-    cube = splat(1.5) * (b - c) + half * (d - a)
+    one, square, cube = function_lanes.powers(a, b, c, d)
     value = b + u * (one + u * (square + u * cube))
-    return value, one + u * (two * square + u * splat(3.0) * cube)
+    return value, one + u * (splat(2.0) * square + u * splat(3.0) * cube)
 
 
 @njit(**BORROWING)

@@ -51,13 +51,8 @@ def forecast(
 ) -> Prediction:
     """See `Fit.forecast`."""
     earlier, later, gap = following(fit, past, future)
-    with_outputs([earlier], "past")
     with torch.no_grad():
-        before = output_process(beginning(fit, earlier, predicting=True), earlier)
-        next_inputs = arrive(fit.system, later).inputs[..., 0, :]
-        start = before.state_after(
-            earlier.observations, gap, next_inputs, process_noise=process_noise
-        )
+        before, start = _after(fit, earlier, later, gap, process_noise)
         # Noise that follows the output continues from where the past has brought the output.
         time = np.append(past.time, past.time[-1] + gap + (future.time - future.time[0]))
         system = fit.system if process_noise else fit.system.without_process_noise
@@ -65,6 +60,17 @@ def forecast(
         inputs = torch.cat([before.scaled_inputs, outputs.scaled_inputs], -2)
         outputs.noise_sd = before.system.noise_sd(inputs, time)[..., len(past) :, :]
         return _forward(fit, later, outputs, samples, seed, "forecast")
+
+
+def _after(
+    fit: Fitted, earlier: PreparedRecord, later: PreparedRecord, gap: float, process_noise: bool
+) -> tuple[OutputProcess, JointState]:
+    """Outputs along a past, and the state at the first sample of what follows it."""
+    with_outputs([earlier], "past")
+    before = output_process(beginning(fit, earlier, predicting=True), earlier)
+    next_inputs = arrive(fit.system, later).inputs[..., 0, :]
+    y = earlier.observations
+    return before, before.state_after(y, gap, next_inputs, process_noise=process_noise)
 
 
 def runs_after(
@@ -82,13 +88,9 @@ def runs_after(
         found = forecast(fit, past, future, process_noise=False, samples=samples, seed=seed)
         return found.component_mean
     earlier, later, gap = following(fit, past, future)
-    with_outputs([earlier], "past")
     with torch.no_grad(), seeded(seed):
-        before = output_process(beginning(fit, earlier, predicting=True), earlier)
-        next_inputs = arrive(fit.system, later).inputs[..., 0, :]
-        given = before.state_after(earlier.observations, gap, next_inputs, process_noise=False)
-        random = torch.randn(given.mean.shape, dtype=torch.float64)
-        state = given.mean + (given.root() @ random.unsqueeze(-1)).squeeze(-1)
+        _, given = _after(fit, earlier, later, gap, process_noise=False)
+        state = given.drawn(torch.randn(given.mean.shape, dtype=torch.float64))
         start = JointState(state, torch.zeros_like(given.covariance))
         outputs = output_process(fit.system.without_process_noise, later, start=start)
         return outputs.components(samples=1, seed=seed).mean

@@ -18,6 +18,8 @@ import numpy as np
 
 from pyro_dynogp.data.signals import held
 
+# In `where` of evidence of an input that is computed from the output: the channel it is set by.
+SET = "set point"
 # Samples that a controller looks back.
 LAGS = 3
 # Share of an input's variance below which its own past and the set point foretell it: it could be

@@ -36,7 +36,7 @@ from tests.benchmarks.kept_rows import append_row, read_rows
 from tests.benchmarks.naming_cases import KEY, Case, Choice, cases_of, choice_of, chosen_by
 from tests.benchmarks.naming_peers import peers_of
 from tests.benchmarks.naming_table import UNDECLARED, is_right, tables
-from tests.discrepancy.machines import Machine, machine, outside
+from tests.discrepancy.machines import Machine, machine, outside, rows_of
 
 KEPT = Path("docs/planted")
 SCORES = ("rmse", "mae", "crps", "coverage_50", "coverage_95")
@@ -78,7 +78,7 @@ def study(case: Case, samples: int | None = None) -> Row:
     row = case.fields | truth(one)
     try:
         with warnings.catch_warnings(record=True) as said:
-            warnings.simplefilter("always", UserWarning)
+            warnings.simplefilter("always", UserWarning)  # each goes into the row
             row |= _closed(case, one)
     except Exception as error:  # a case that fails is a result: it is counted
         traceback.print_exc()
@@ -160,8 +160,7 @@ def floor_of(one: Machine, part: dgp.Record) -> float:
     Of several outputs it is the mean of their root mean square errors, where `Machine.floor` is
     the root of the mean over all of them.
     """
-    rows = np.searchsorted(one.record.time, part.time)
-    squares = np.nanmean((part.outputs - one.noise_free[rows]) ** 2, axis=0)
+    squares = np.nanmean((part.outputs - one.noise_free[rows_of(one.record, part)]) ** 2, axis=0)
     return float(np.sqrt(squares).mean())
 
 

@@ -126,7 +126,7 @@ def _packed(system: System) -> Packed:
 
 
 @numba.njit(cache=True)
-def _slope(x, v, A, B, codes, sees, acts, scales, columns):  # type: ignore[no-untyped-def]
+def _slope(x, v, A, B, codes, sees, acts, scales, columns):
     s = len(x)
     out = np.zeros(s)
     for i in range(s):
@@ -138,13 +138,13 @@ def _slope(x, v, A, B, codes, sees, acts, scales, columns):  # type: ignore[no-u
         z = 0.0
         for j in range(s):
             z += sees[k, j] * x[j]
-        if codes[k] == 0:
+        if codes[k] == TANH:
             f = np.tanh(z / scales[k])
-        elif codes[k] == 1:
+        elif codes[k] == CUBE:
             f = z**3
-        elif codes[k] == 2:
+        elif codes[k] == ROOT:
             f = np.sqrt(max(z, 0.0))
-        else:
+        else:  # PRODUCT
             f = z * v[columns[k]]
         for i in range(s):
             out[i] += acts[k, i] * f
@@ -152,7 +152,7 @@ def _slope(x, v, A, B, codes, sees, acts, scales, columns):  # type: ignore[no-u
 
 
 @numba.njit(cache=True)
-def _advanced(x, v, h, A, B, codes, sees, acts, scales, columns):  # type: ignore[no-untyped-def]
+def _advanced(x, v, h, A, B, codes, sees, acts, scales, columns):
     k1 = _slope(x, v, A, B, codes, sees, acts, scales, columns)
     k2 = _slope(x + 0.5 * h * k1, v, A, B, codes, sees, acts, scales, columns)
     k3 = _slope(x + 0.5 * h * k2, v, A, B, codes, sees, acts, scales, columns)
@@ -161,7 +161,7 @@ def _advanced(x, v, h, A, B, codes, sees, acts, scales, columns):  # type: ignor
 
 
 @numba.njit(cache=True)
-def _solved(x, v, h, parts, A, B, codes, sees, acts, scales, columns):  # type: ignore[no-untyped-def]
+def _solved(x, v, h, parts, A, B, codes, sees, acts, scales, columns):
     n = len(v) // parts
     states = np.zeros((n, len(x)))
     for k in range(n):
@@ -172,7 +172,7 @@ def _solved(x, v, h, parts, A, B, codes, sees, acts, scales, columns):  # type: 
 
 
 @numba.njit(cache=True)
-def _controlled(  # type: ignore[no-untyped-def]
+def _controlled(
     x, wanted, disturbance, gain, reset, bias, C, level, h, parts, packed,
 ):  # fmt: skip
     n = len(wanted)

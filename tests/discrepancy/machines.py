@@ -80,11 +80,21 @@ class Machine:
         Raises:
             ValueError: where `part` is no part of the record.
         """
-        rows = np.searchsorted(self.record.time, part.time)
-        inside = rows < len(self.record)
-        if not inside.all() or not np.array_equal(self.record.time[rows], part.time):
-            raise ValueError("part: expected samples of the machine's record, got other times.")
+        rows = rows_of(self.record, part)
         return float(np.sqrt(np.nanmean((part.outputs - self.noise_free[rows]) ** 2)))
+
+
+def rows_of(record: dgp.Record, part: dgp.Record) -> NDArray[np.intp]:
+    """Samples of a machine's record that a part of it consists of.
+
+    Raises:
+        ValueError: where `part` is no part of the record.
+    """
+    rows = np.searchsorted(record.time, part.time)
+    inside = rows < len(record)
+    if not inside.all() or not np.array_equal(record.time[rows], part.time):
+        raise ValueError("part: expected samples of the machine's record, got other times.")
+    return rows
 
 
 def machine(
