@@ -14,7 +14,7 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.blocks import Blocks, shared
 from pyro_dynogp.discrepancy.decision import Confirmed, confirm
 from pyro_dynogp.discrepancy.held_out import certain, forecast_density, forecast_errors, without
-from pyro_dynogp.discrepancy.residuals import residuals_of
+from pyro_dynogp.discrepancy.residuals import free_run_of, residuals_of
 from pyro_dynogp.discrepancy.search import Found, look, rated
 from pyro_dynogp.effects import Effect
 from pyro_dynogp.inference.refit import refit
@@ -103,6 +103,7 @@ class SearchContext:
         """Of every output, with the candidates that the model does not use."""
         taken = used_channels(fit.model)
         free = [name for name in self.names if name not in taken]
+        run = free_run_of(fit, record, seed=self.seed, settings=self.settings)
         return [
             residuals_of(
                 fit,
@@ -112,6 +113,7 @@ class SearchContext:
                 output=a,
                 seed=self.seed,
                 settings=self.settings,
+                run=run,
             )
             for a in range(record.n_outputs)
         ]

@@ -9,6 +9,7 @@ import numpy as np
 
 from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.discrepancy.joint_refits import confirmed_together
 from pyro_dynogp.discrepancy.judged import Judged, kind_of
 from pyro_dynogp.discrepancy.refits import Refits
 from pyro_dynogp.discrepancy.result import Attempt
@@ -79,6 +80,10 @@ def confirm(
         Attempt(number, found.evidence, found.q_value, "not tried", STRUCTURE_FIRST)
         for found, _ in waiting
     ]
+    if not any(one.helps for one in judged):
+        first = confirmed_together(refits, judged, level)
+        if first is not None:
+            judged = [first if one.found is first.found else one for one in judged]
     better = _first_in_line([one for one in judged if one.helps], level)
     playing = refits.on_one_scale(better) if better and not refits.early else []
     if refits.early:

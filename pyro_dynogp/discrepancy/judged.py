@@ -18,6 +18,8 @@ from pyro_dynogp.statistics.settings import LoopSettings
 # Where densities are scored: after the training data, or on blocks spread over the whole record.
 Where = Literal["after", "spread"]
 Kind = tuple[Where, Score]
+# Of forecasts of blocks that are spread over the record.
+SPREAD: Kind = ("spread", "forecast")
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +36,7 @@ class Judged:
 def kind_of(found: Found) -> Kind:
     """Where an effect is scored, and on which densities."""
     effect = found.effect
-    return ("spread", "forecast") if effect.localised else ("after", effect.score)
+    return SPREAD if effect.localised else ("after", effect.score)
 
 
 def judge(

@@ -12,7 +12,7 @@ import numpy as np
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.held_out import interleaved
-from pyro_dynogp.discrepancy.judged import Judged, Kind, judge, kind_of
+from pyro_dynogp.discrepancy.judged import SPREAD, Judged, Kind, judge, kind_of
 from pyro_dynogp.discrepancy.search import Candidate, Found
 from pyro_dynogp.discrepancy.trials import Trial, Tried, run, with_substeps
 from pyro_dynogp.fitting import Fit
@@ -110,17 +110,16 @@ class Refits:
         """The same candidates scored alike, since gains on different densities do not compare."""
         if len({one.kind for one in better}) == 1:
             return list(better)
-        common: Kind = ("spread", "forecast")
-        others = [one for one in better if one.kind != common]
+        others = [one for one in better if one.kind != SPREAD]
         more = {
-            repr(one.tried.model): self.trial((one.tried.model,), common, one.found)
+            repr(one.tried.model): self.trial((one.tried.model,), SPREAD, one.found)
             for one in others
         }
         again = self.run(more, "refits once more")
         if self.early:
             return list(better)
         return [
-            one if one.kind == common
-            else self.judged(one.found, common, again[repr(one.tried.model)])
+            one if one.kind == SPREAD
+            else self.judged(one.found, SPREAD, again[repr(one.tried.model)])
             for one in better
         ]  # fmt: skip

@@ -27,6 +27,7 @@ Outcome = Decision | Literal["not significant"]
 # The outcome where what was found does harm on the last block.
 KEPT = "effects named, model kept"
 WORSE_WITH = "with it the model does worse on the last block"
+WITHOUT_NOISE = "the model forecasts better without its process noise, and is now without it"
 RELY_ON_BEFORE = (
     "with them the model does worse on the last block. Rely on the model before (report.fit), not "
     "on the extended one (report.extended)."
@@ -159,6 +160,8 @@ class LoopResult:
         forecast_before, forecast_after: of C by `base` and `extended`.
         model_before, model_after: those models in words, part by part.
         seconds: by stage.
+        noise_dropped: whether nothing was added, and `extended` is the model given without its
+            process noise, which forecasts held-out data better so.
     """
 
     effects: tuple[FoundEffect, ...]
@@ -183,6 +186,7 @@ class LoopResult:
     model_before: tuple[Part, ...]
     model_after: tuple[Part, ...]
     seconds: Mapping[str, float] = field(default_factory=dict)
+    noise_dropped: bool = False
 
     @property
     def model_kept(self) -> bool:
@@ -199,6 +203,7 @@ class LoopResult:
             "elpd_gain": self.elpd_gain,
             "elpd_gain_error": self.elpd_gain_error,
             "model_kept": self.model_kept,
+            "noise_dropped": self.noise_dropped,
             "last_block_tests": {k: list(pair) for k, pair in self.last_block_tests.items()},
             "attempts": [
                 _plain(one) | {"channel": one.channel, "output": one.output}
@@ -249,6 +254,8 @@ class LoopResult:
             return f"{said}: {RELY_ON_BEFORE}"
         if self.left_out:
             return f"{said}; {' and '.join(self.left_out)} named, but left out: {WORSE_WITH}."
+        if self.noise_dropped:
+            return f"{said}; {WITHOUT_NOISE}."
         return f"{said}."
 
     @property

@@ -50,6 +50,9 @@ class SearchState:
         reported: what no block mends, by the last tests.
         left: what is left, in words, by the last tests. notes: what else there is to say.
         early: whether the time limit was passed before the search came to its end.
+        dropped: whether nothing was found to add, and the model as given forecasts held-out data
+            better without its process noise: the last fit is that one. left_without: what it
+            leaves, in words.
     """
 
     rounds: SearchContext
@@ -71,6 +74,8 @@ class SearchState:
     left: tuple[str, ...] = ()
     notes: list[str] = field(default_factory=list)
     early: bool = False
+    dropped: bool = False
+    left_without: tuple[str, ...] = ()
     _looked: Tested | None = None
     _omnibus: Sequence[float] = ()
 
@@ -104,6 +109,7 @@ class SearchState:
             return True
         if not (self.left and self.quiet) or self.accepted or self.early:
             return False
+        self.left_without = self.left
         self._go_on_from(self.first)
         self.quiet, self.returned = False, True
         return True
@@ -118,6 +124,9 @@ class SearchState:
                 break
         if not self.early:
             self.doubt()
+        if (self.quiet or self.returned) and not (self.accepted or self.early):
+            self.dropped = True
+            self.fits.append(self.plain)
 
     def stopped(self) -> bool:
         """Whether the time limit was passed before the search came to its end."""
@@ -179,21 +188,19 @@ class SearchState:
         """That process noise hides what is missing, and what was done about it."""
         if not self.hidden:
             return []
-        back = has_process_noise(self.current.model)
         if not has_process_noise(self.first.model):  # it is in some layers only
             done = "Fit it with process_noise=False, and close the loop on that."
-        elif not self.returned:
+        elif self.dropped:
+            ways = "with or without it" if self.returned else "without it"
+            done = f"Nothing was found to add {ways}."
+        elif self.returned:
+            done = "The search without it found nothing to add, and began again with it."
+        elif not self.accepted:
+            done = "The search began without it."
+        else:
+            back = has_process_noise(self.current.model)
             done = "The search began without it, and the extended model " + (
                 "has it again: there it costs nothing." if back else "does without it."
-            )
-            if not self.accepted:
-                done = "Without it nothing is missing: fit it with process_noise=False."
-        elif self.accepted:
-            done = "The search without it found nothing to add, and began again with it."
-        else:
-            done = (
-                "Neither without it nor with it did the search find anything to add: fit it with "
-                "process_noise=False."
             )
         return [f"The model as given {self.hidden}: such noise can hide what is missing. {done}"]
 

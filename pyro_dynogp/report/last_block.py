@@ -36,7 +36,8 @@ def report_of(fits: Sequence[Fit], course: SearchState, warnings: Sequence[str])
     """Open block C, once.
 
     Args:
-        fits: last fits of the model as given, with the first effect, with the first two, and so on.
+        fits: last fits of the model as given, with the first effect, with the first two, and so on;
+            or of the model as given, and of that without its process noise.
         course: what the rounds came to. warnings: what else is to be known.
     """
     rounds, watch, accepted = course.rounds, course.watch, course.accepted
@@ -57,13 +58,17 @@ def report_of(fits: Sequence[Fit], course: SearchState, warnings: Sequence[str])
         return Compared(measured[before], measured[after], float(gain.sum()), error,
                         rounds.settings)  # fmt: skip
 
-    count = len(accepted)
+    count = len(fits) - 1
     kept = without_harm(count, compared)
     # Where nothing is kept the extended model is the one with everything, for comparison.
-    last = kept or count
+    last = kept or len(accepted)
     base, extended, change = fits[0], fits[last], compared(last, 0)
     said = change.disagreement
-    if kept < count:
+    without_noise = course.dropped and kept > 0
+    left = course.left_without if without_noise else course.left
+    if course.dropped:
+        said = [compared(1, 0).of_noise(without_noise), *said]
+    elif kept < count:
         names = [found.effect.name for found, _ in accepted[kept:]]
         said = [compared(count, kept).left_out(names) if kept else change.harm, *said]
     watch.stop("scores of the last block")
@@ -79,7 +84,7 @@ def report_of(fits: Sequence[Fit], course: SearchState, warnings: Sequence[str])
     watch.stop("numbers of the effects")
     return Report(
         effects=(*effects, *(_only_reported(f) for f in course.reported)),
-        outcome=_outcome(course, harm=last > kept),
+        outcome=_outcome(course, left, harm=last > kept),
         before=measured[0],
         after=measured[last],
         elpd_gain=change.gain,
@@ -89,7 +94,8 @@ def report_of(fits: Sequence[Fit], course: SearchState, warnings: Sequence[str])
         extended=extended,
         attempts=tuple(course.attempts),
         tests=tuple(course.tests),
-        left=course.left,
+        left=left,
+        noise_dropped=without_noise,
         warnings=(*said, *warnings),
         data=data.sentence,
         last_block_tests=tests,
@@ -165,6 +171,18 @@ class Compared:
         )
         return f"{scores}, elpd {self.gain:+.1f} +- {self.error:.1f} nats"
 
+    def of_noise(self, dropped: bool) -> str:
+        """In words, what the model without process noise does, and whether the fit is that one."""
+        which = (
+            "without its process noise. Its bands are those of parameters and measurement noise"
+            if dropped
+            else "as it was given"
+        )
+        return (
+            f"Without process noise the last block is forecast so ({self._change}): report.fit is "
+            f"the model {which}."
+        )
+
     @property
     def harm(self) -> str:
         """In words, that all that was added does harm."""
@@ -197,14 +215,14 @@ class Compared:
         ]
 
 
-def _outcome(course: SearchState, harm: bool) -> str:
+def _outcome(course: SearchState, left: Sequence[str], *, harm: bool) -> str:
     if harm:
         return KEPT
     if course.early:
         return "effects added, search ended early" if course.accepted else "search ended early"
     if course.accepted:
-        return "effects added, structure left" if course.left else "effects added"
-    return "structure left, cause unknown" if course.left else "nothing missing"
+        return "effects added, structure left" if left else "effects added"
+    return "structure left, cause unknown" if left else "nothing missing"
 
 
 def _tested(

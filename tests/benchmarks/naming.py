@@ -146,7 +146,6 @@ def collect(one: Machine, report: Any) -> Row:
         "p_values": [float(effect.p_value) for effect in report.effects],
         "ties": [list(effect.ties) for effect in report.effects],
         "kept": [bool(effect.kept) for effect in report.effects],
-        "reported": sorted({a.name for a in report.attempts if a.decision == "reported"}),
         "outcome": str(report.outcome),
         "headline": str(report.headline),
         "floor": floor_of(one, sealed),

@@ -14,7 +14,7 @@ from tests.benchmarks.markdown import table
 from tests.benchmarks.planted_table import interval, relied_on
 
 Row = Mapping[str, Any]
-UNDECLARED, FEEDBACK = "undeclared input", "feedback"
+UNDECLARED = "undeclared input"
 STRENGTHS = ("weak", "middle", "strong", "none")
 PLANTED_GROUPS = ("single", "two", "three")
 # RMSE after over that before, on the last block, above which a loop did harm.
@@ -28,14 +28,12 @@ PEERS = (
 
 
 def names_of(row: Row) -> list[tuple[str, str | None]]:
-    """Names with their channels: of the report's effects, and feedback that was reported.
+    """Names with their channels, of the effects that a report ends with.
 
-    Empty where the fit or the loop failed.
+    What an early round reported and an added effect explains (a wrong clock looks like feedback) is
+    none. Empty where the fit or the loop failed.
     """
-    found = list(zip(row.get("named", ()), row.get("channels", ()), strict=True))
-    if FEEDBACK in row.get("reported", ()) and (FEEDBACK, None) not in found:
-        found.append((FEEDBACK, None))
-    return found
+    return list(zip(row.get("named", ()), row.get("channels", ()), strict=True))
 
 
 def says(row: Row, effect: str, name: str, channel: str | None) -> bool:
@@ -280,7 +278,7 @@ def _peer_table(rows: Sequence[Row]) -> str:
 
 def as_said(row: Row, said: Mapping[str, Sequence[Any]]) -> Row:
     """A row as it would be if the names were those of another tool, which has no ties."""
-    return {**row, **said, "ties": [[] for _ in said["named"]], "reported": []}
+    return {**row, **said, "ties": [[] for _ in said["named"]]}
 
 
 def _wrong_table(rows: Sequence[Row]) -> str:

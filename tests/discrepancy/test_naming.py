@@ -50,7 +50,6 @@ def row(*planted: str, named=(), channels=None, ties=None, **changes) -> dict:
         "p_values": [0.01] * len(named),
         "ties": list(ties or [[] for _ in named]),
         "kept": [True] * len(named),
-        "reported": [],
         "outcome": "effects added" if named else "nothing missing",
         "floor": 0.5,
         "before": {"rmse": 2.0, "coverage_95": 0.7},
@@ -91,12 +90,11 @@ def test_a_tie_is_neither_right_nor_superfluous():
     assert tied(row("drift", named=["drift"], ties=[["drift"]])) == []
 
 
-def test_feedback_that_is_reported_counts():
-    assert is_right(row("feedback", reported=["feedback"]))
-    assert names_of(row("feedback", named=["feedback"], reported=["feedback"])) == [
-        ("feedback", None)
-    ]
-    assert superfluous(row(reported=["feedback"])) == ["feedback"]
+def test_feedback_counts_where_the_report_ends_with_it():
+    assert is_right(row("feedback", named=["feedback"]))
+    assert names_of(row("feedback", named=["feedback"])) == [("feedback", None)]
+    assert superfluous(row(named=["feedback"])) == ["feedback"]
+    assert not is_right(row("feedback"))
 
 
 def test_a_cause_outside_the_catalogue_is_left_open():
@@ -244,7 +242,6 @@ def test_channels_are_those_of_accepted_attempts():
     assert found["channels"] == ["b", None, None]
     assert found["ties"] == [[], ["level shift"], []]
     assert found["kept"] == [True, False, True]
-    assert found["reported"] == ["feedback"]
     quarter = one.record[3 * len(one.record) // 4 :]
     assert found["floor"] == pytest.approx(one.floor(quarter), rel=1e-12)
     assert json.loads(json.dumps(found)) == found

@@ -6,6 +6,7 @@ import torch
 from scipy.signal import lfilter
 
 import pyro_dynogp as dgp
+from pyro_dynogp.criticism import posterior_draws
 from pyro_dynogp.discrepancy import residuals
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.mode import at_optimum
@@ -142,3 +143,74 @@ def test_parameter_draws_at_which_the_filter_fails_are_left_out(modes, monkeypat
     assert len(residuals._runs(none, past, rest, 6, 0)) == 0
     _, component = residuals._free_run(fit, none, record, 12, 6, 0)
     np.testing.assert_array_equal(component, none.simulate(record, seed=0).component_mean)
+
+
+@pytest.fixture(scope="module")
+def sensor():
+    """A fit of a linear system behind a bent sensor."""
+    rng = np.random.default_rng(3)
+    t = 0.1 * np.arange(240)
+    u = np.repeat(rng.standard_normal(60), 4)
+    x = lfilter([0.0, 1.0 - np.exp(-0.1)], [1.0, -np.exp(-0.1)], u)
+    y = x + 0.4 * x**2 + 0.02 * rng.standard_normal(240)
+    record = dgp.Record(t, u[:, None], y[:, None])
+    model = dgp.Wiener(1, pairs=1, inducing=6, process_noise=False, initial_state="zero")
+    return record, dgp.fit(model, record, method="map", restarts=2, workers=1, progress=False)
+
+
+def test_runs_of_functions_are_linear_in_the_parameters(sensor):
+    """Variances are those of finite differences of simulations; the first state is known."""
+    record, fit = sensor
+
+    def runs(some):
+        """One run (S, n) for each draw."""
+        found = some.simulate(record, process_noise=False, samples=some.n_draws, seed=0)
+        return found.component_mean[: some.n_draws, :, 0]
+
+    def run(some):
+        return fit.simulate(record, process_noise=False, seed=0).mean, runs(some)
+
+    found = residuals._straight(run, fit, 3000, 1)[1].var(0)
+    normal = posterior_draws.normal_near(fit)
+    z, root = normal.loc[0], normal.scale_tril[0].numpy()
+    steps = torch.cat([torch.eye(len(z), dtype=torch.float64)] * 2)
+    steps[len(z) :] *= -1.0
+    at_both = runs(fit.with_draws(normal.at_latent(z + 1e-4 * steps)))
+    up, down = np.split(at_both, 2)
+    slopes = (up - down) / 2e-4
+    expected = np.square(slopes.T @ root).sum(1)
+    late = slice(60, None)
+    np.testing.assert_allclose(found[late], expected[late], rtol=0.15)
+    # A posterior spreads simulations by less than the noise; draws as they are do not.
+    assert found[late].mean() < 0.02**2
+    loose = fit.with_draws(normal.draws(200, 0).values)
+    assert runs(loose).var(0)[late].mean() > 2.0 * found[late].mean()
+
+
+def test_the_normal_near_a_mode_is_laplaces_where_parameters_are_well_known(sensor):
+    record, _ = sensor
+    model = dgp.LinearDynamicGP(1, pairs=1, process_noise=False)
+    y = lfilter([0.0, 0.3], [1.0, -1.6, 0.9], record.inputs[:, 0])
+    y += 0.01 * np.random.default_rng(0).standard_normal(len(y))
+    fit = dgp.fit(model, record.with_outputs(y), method="map", workers=1, progress=False)
+    near, laplace = posterior_draws.normal_near(fit), posterior_draws.laplace(fit, fit.mode)
+    ratio = torch.linalg.svdvals(torch.linalg.solve(laplace.scale_tril[0], near.scale_tril[0]))
+    assert 0.7 < ratio.min() <= ratio.max() < 1.4
+    tenth = posterior_draws.normal_near(fit, 0.1).scale_tril
+    torch.testing.assert_close(tenth, 0.1 * near.scale_tril)
+
+
+def test_one_free_run_serves_every_output(sensor, monkeypatch):
+    record, _ = sensor
+    y = record.outputs[:, 0]
+    both = dgp.Record(record.time, record.inputs, np.column_stack([y, np.roll(y, 3)]))
+    model = dgp.LinearDynamicGP(1, outputs=2, pairs=1, process_noise=False)
+    fit = dgp.fit(model, both, method="map", restarts=1, workers=1, progress=False)
+    settings = LoopSettings()
+    alone = [residuals.residuals_of(fit, both, output=a, settings=settings) for a in (0, 1)]
+    run = residuals.free_run_of(fit, both, seed=0, settings=settings)
+    monkeypatch.setattr(residuals, "free_run_of", None)
+    for a, one in enumerate(alone):
+        again = residuals.residuals_of(fit, both, output=a, settings=settings, run=run)
+        np.testing.assert_array_equal(again.residual, one.residual)
+        np.testing.assert_array_equal(again.deviations, one.deviations)

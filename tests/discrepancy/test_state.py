@@ -207,23 +207,24 @@ def test_what_goes_with_inputs_under_feedback_is_not_tried(effect, p, certain, f
 
 
 @pytest.mark.parametrize(
-    ("noise", "accepted", "returned", "said"),
+    ("noise", "accepted", "returned", "dropped", "said"),
     [
-        ((True, False), True, False, "the extended model does without it"),
-        ((True, True), True, False, "the extended model has it again"),
-        ((True, True), True, True, "found nothing to add, and began again with it"),
-        ((True, True), False, True, "to add: fit it with process_noise=False"),
-        ((True, False), False, False, "Without it nothing is missing"),
-        ((False, False), True, False, "Fit it with process_noise=False"),  # in some layers only
+        ((True, False), True, False, False, "the extended model does without it."),
+        ((True, True), True, False, False, "the extended model has it again"),
+        ((True, True), True, True, False, "found nothing to add, and began again with it."),
+        ((True, False), False, True, True, "Nothing was found to add with or without it."),
+        ((True, False), False, False, True, "Nothing was found to add without it."),
+        ((True, False), False, False, False, "The search began without it."),  # and ended early
+        ((False, False), True, False, False, "Fit it with process_noise=False"),  # in some layers
     ],
 )
-def test_what_was_done_about_noise_that_hides_is_said(noise, accepted, returned, said):
+def test_what_was_done_about_noise_that_hides_is_said(noise, accepted, returned, dropped, said):
     first, current = (
         SimpleNamespace(model=MODEL if one else without_process_noise(MODEL)) for one in noise
     )
     course = SimpleNamespace(
         hidden="forecasts better", first=first, current=current, accepted=accepted,
-        returned=returned,
+        returned=returned, dropped=dropped,
     )  # fmt: skip
     (sentence,) = SearchState.said_of_hiding(course)
     assert sentence.startswith("The model as given forecasts better")

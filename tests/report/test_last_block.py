@@ -9,7 +9,9 @@ import pytest
 
 import pyro_dynogp as dgp
 from pyro_dynogp import LoopSettings, effects
+from pyro_dynogp.discrepancy.context import SearchContext
 from pyro_dynogp.discrepancy.result import KEPT
+from pyro_dynogp.models.variants import has_process_noise
 from pyro_dynogp.report import last_block
 from pyro_dynogp.report.last_block import Compared, _outcome, without_harm
 from tests.discrepancy.test_loop import close, fitted, machine
@@ -103,8 +105,8 @@ def test_the_last_effects_stay_only_where_they_do_no_harm(errors: list[float], k
     ],
 )
 def test_outcomes(accepted: bool, left: bool, early: bool, harm: bool, outcome: str) -> None:
-    course: Any = SimpleNamespace(accepted=accepted, left=left, early=early)
-    assert _outcome(course, harm) == outcome
+    course: Any = SimpleNamespace(accepted=accepted, early=early)
+    assert _outcome(course, ["structure"] * left, harm=harm) == outcome
 
 
 def turned(**options: Any) -> dgp.Record:
@@ -185,3 +187,75 @@ def test_of_two_effects_the_one_that_does_harm_is_left_out(tmp_path: Any) -> Non
     assert "drift named too, but left out" in headline
     assert said in page
     assert report.to_dict()["effects"][1]["kept"] is False
+
+
+@pytest.fixture
+def hiding(monkeypatch: pytest.MonkeyPatch) -> dgp.Record:
+    """A linear plant, of whose model the search is told that its process noise hides something."""
+    monkeypatch.setattr(
+        SearchContext, "hiding", lambda self, fit, plain: "" if fit is plain else "hides"
+    )
+    return machine(seed=2)
+
+
+def noisy(record: dgp.Record) -> dgp.Fit:
+    model = dgp.LinearDynamicGP(inputs=1, pairs=1)
+    return dgp.fit(model, record[:240], restarts=2, workers=1, progress=False, method="map")
+
+
+def test_where_nothing_is_missing_but_noise_costs_forecasts_it_is_left_out(
+    hiding: dgp.Record, tmp_path: Any
+) -> None:
+    report = close(noisy(hiding), hiding)
+    assert not report.effects
+    assert report.noise_dropped
+    assert report.outcome == "nothing missing"
+    assert has_process_noise(report.base.model)
+    assert not has_process_noise(report.fit.model)
+    assert report.fit is report.extended
+    assert report.before != report.after
+    assert report.headline.endswith("without its process noise, and is now without it.")
+    assert report.warnings[0].startswith("Without process noise the last block is forecast so")
+    assert report.to_dict()["noise_dropped"] is True
+    report.to_html(tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    headline = page.partition("<h1>")[2].partition("</h1>")[0]
+    assert headline.startswith("No effect was found that the model lacks; ")
+    assert "of the forecast goes from" in page
+
+
+def test_where_the_last_block_is_worse_without_noise_the_model_keeps_it(
+    hiding: dgp.Record, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(last_block.Compared, "does_harm", True)
+    report = close(noisy(hiding), hiding)
+    assert not report.noise_dropped
+    assert report.outcome == "nothing missing"
+    assert report.fit is report.base is report.extended
+    assert report.before == report.after
+    assert report.headline == "Nothing missing."
+    assert "report.fit is the model as it was given." in report.warnings[0]
+
+
+@pytest.mark.parametrize("harm", [False, True])
+def test_what_is_left_is_said_of_the_model_that_the_report_gives(
+    hiding: dgp.Record, monkeypatch: pytest.MonkeyPatch, harm: bool
+) -> None:
+    """Without its noise the model leaves something, with it nothing."""
+    monkeypatch.setattr(last_block.Compared, "does_harm", harm)
+    monkeypatch.setattr(
+        SearchContext, "left",
+        lambda self, looked: ((), (1.0,)) if has_process_noise(self.looked_at)
+        else (("something",), ()),
+    )  # fmt: skip
+    look = SearchContext.look
+
+    def looking(self: SearchContext, fit: dgp.Fit, *args: Any) -> Any:
+        self.looked_at = fit.model  # type: ignore[attr-defined]
+        return look(self, fit, *args)
+
+    monkeypatch.setattr(SearchContext, "look", looking)
+    report = close(noisy(hiding), hiding)
+    assert report.noise_dropped is not harm
+    assert report.left == (() if harm else ("something",))
+    assert report.outcome == ("nothing missing" if harm else "structure left, cause unknown")

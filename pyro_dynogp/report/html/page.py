@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pyro_dynogp.discrepancy.result import WITHOUT_NOISE
 from pyro_dynogp.report.html.diagram import diagram, marks
 from pyro_dynogp.report.html.effects import all_tests, attempts, effects
 from pyro_dynogp.report.html.html import (
@@ -106,10 +107,12 @@ def _headline(report: LoopResult) -> str:
         if "ended early" in report.outcome:
             return f"{words}; the search ended early."
         return f"{words}; structure of unknown cause is left." if left else f"{words}."
+    more = f"; {WITHOUT_NOISE}." if report.noise_dropped else "."
     if report.outcome == "nothing missing":
-        return "No effect was found that the model lacks."
+        return f"No effect was found that the model lacks{more}"
     if left:
-        return "The model leaves structure in the data that no effect in the catalogue explains."
+        said = "The model leaves structure in the data that no effect in the catalogue explains"
+        return said + more
     return f"{report.outcome[:1].upper()}{report.outcome[1:]}."
 
 
@@ -120,7 +123,7 @@ def _key(report: LoopResult) -> str:
     where = f"On the {n} samples that no step had used before, the root mean square error"
     if not np.isfinite(before):
         return ""
-    if not report.effects or not np.isfinite(after):
+    if not (report.effects or report.noise_dropped) or not np.isfinite(after):
         return paragraph(f"{where} of the forecast is {measure(before, unit)}.", "lead")
     words = f"{where} of the forecast goes from {measure(before, unit)} to {measure(after, unit)}"
     if before > 0 and abs(after / before - 1.0) >= SAME:
