@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -47,16 +47,24 @@ def judge(
     number: int,
     settings: LoopSettings,
 ) -> Judged:
-    """A candidate against the model without it."""
+    """A candidate against the model without it.
+
+    What the residual hardly speaks for has to gain by more standard errors: some of several
+    refits gain by chance.
+    """
     evidence, q = found.evidence, found.q_value
+    errors = settings.standard_errors
+    if evidence.p_value > settings.unsure:
+        errors = max(errors, settings.unsure_errors)
+    enough = replace(settings, standard_errors=errors)
     if tried.failure or base.failure:
         reason = f"could not be fitted: {tried.failure or base.failure}"
         return Judged(found, kind, tried, Attempt(number, evidence, q, "rejected", reason))
     d = tried.densities - base.densities
     gain, error = float(d.sum()), block_standard_error(d)[0]
     reason = f"held-out elpd {gain:+.1f} +- {error:.1f} nats"
-    helps, capped = certain(d, settings), np.minimum(d, settings.cap)
-    if not helps and certain(capped, settings):
+    helps, capped = certain(d, enough), np.minimum(d, settings.cap)
+    if not helps and certain(capped, enough):
         helps = True
         reason += f"; {capped.sum():+.1f} with no sample counted for more than {settings.cap:.0f}"
     harms = False
@@ -68,7 +76,7 @@ def judge(
                 f"; forecasts worse by {loss.sum():.1f} +- {block_standard_error(loss)[0]:.1f}"
             )
     helps = helps and not harms
-    wanted = 0 if helps or harms else enough_samples(gain, error, len(d), settings)
+    wanted = 0 if helps or harms else enough_samples(gain, error, len(d), enough)
     if wanted:
         reason += f"; about {wanted} samples like these {len(d)} would settle it"
     decision: Decision = "nearly" if wanted else "rejected"

@@ -136,6 +136,7 @@ def residuals_of(
         time_unit=record.time_unit,
         step=record.sampling_time,
         stamps=record.timestamps,
+        linear=fit.model.is_linear,
     )
 
 

@@ -98,7 +98,7 @@ def with_kernels_by_evidence(
         without the functions' values [nats].
     """
     names = kernel_sites(model)
-    optimizer = "gauss-newton" if has_innovations(model) else optimizer_near(model)
+    optimizer = optimizer_near(model)
     here = _Expansion.at(model, records, optimum.values)
     for number in range(rounds):
         values, gain = here.best()

@@ -114,19 +114,24 @@ def race(
     found: list[FittedKind] = []
     problems: list[str] = []
 
-    def after(steps: tuple[int, int], model: Model) -> Run:
+    def after(steps: tuple[int, int], optimizer: str) -> Run:
         newton, other = steps
-        quick = optimizer_near(model) == "gauss-newton"
-        return replace(run, steps=newton if quick else other, workers=1)
+        return replace(run, steps=newton if optimizer == "gauss-newton" else other, workers=1)
+
+    def first(model: Model) -> str:
+        layered = len(model.layers) > len(fit.model.layers)
+        return optimizer_for(model) if layered else optimizer_near(model)
 
     for model in models:
         try:
-            found.append(refit(fit, record, model=model, run=after(FIRST_STEPS, model)))
+            found.append(refit(fit, record, model=model, run=after(FIRST_STEPS, first(model))))
         except ValueError as error:  # for instance a channel that is constant there
             problems.append(str(error))
     found.sort(key=energy)
     cut = max(FEWEST, round(LEADING * len(found)))
-    further = [refit(f, f.records, run=after(MORE_STEPS, f.model)) for f in found[:cut]]
+    further = [
+        refit(f, f.records, run=after(MORE_STEPS, optimizer_near(f.model))) for f in found[:cut]
+    ]
     return sorted([*further, *found[cut:]], key=energy), problems
 
 
@@ -176,8 +181,8 @@ def _again(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
 
 
 def _held(model: Model) -> tuple[str, ...]:
-    """Sites that keep what is learnt while all else climbs, see `_settled`."""
-    return kernel_sites(model) if model.has_feedback else ()
+    """Sites that keep what is learnt while Gauss-Newton climbs: kernels, see `optimizer_near`."""
+    return kernel_sites(model) if optimizer_near(model) == "gauss-newton" else ()
 
 
 def _settled(problem: Problem, optima: list[Optimum], run: Run) -> list[Optimum]:

@@ -30,6 +30,7 @@ class Residuals:
         held_out: (n,) True where neither fit nor scaling has seen the output.
         output_name, output_unit, time_unit: for sentences.
         step: sampling step [time unit].
+        linear: whether the model is linear, without static functions.
     """
 
     time: np.ndarray
@@ -47,6 +48,7 @@ class Residuals:
     time_unit: str
     step: float
     stamps: pd.DatetimeIndex | None = None
+    linear: bool = True
 
     @property
     def residual(self) -> np.ndarray:

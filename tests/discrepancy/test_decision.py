@@ -165,6 +165,22 @@ def test_what_nearly_helps_is_called_so_and_not_added() -> None:
     assert worse.attempt.decision == "rejected"
 
 
+@pytest.mark.parametrize(
+    ("p", "share", "helps"),
+    [(0.009, 2.3, True), (0.011, 2.3, False), (0.011, 3.1, True), (0.011, 2.9, False)],
+)
+def test_what_the_residual_hardly_speaks_for_has_to_gain_more(p, share, helps) -> None:
+    gains = np.random.default_rng(0).standard_normal(400)
+    shifted = gains - gains.mean() + share * block_standard_error(gains)[0] / 400
+    found = spoken_for(effects.Drift(), p, 1.0)
+    judged = judge(found, ("after", "forecast"), tried(shifted), tried(0.0 * gains), 1, SETTINGS)
+    assert judged.helps is helps
+    assert (judged.attempt.decision == "nearly") is not helps
+    strict = replace(SETTINGS, standard_errors=4.0)  # never fewer than of any other effect
+    again = judge(found, ("after", "forecast"), tried(shifted), tried(0.0 * gains), 1, strict)
+    assert not again.helps
+
+
 def test_one_outlier_does_not_hide_what_all_samples_gain() -> None:
     same = np.ones(300)
     gains = 0.3 + np.resize([0.4, -0.4], 300)

@@ -6,8 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from scipy.signal import lfilter
 
 import pyro_dynogp as dgp
+from pyro_dynogp.discrepancy import residuals
 from pyro_dynogp.effects.dead_time import dead_time
 from pyro_dynogp.effects.nonlinear_feedback import (
     NonlinearFeedbackOfOutput,
@@ -16,7 +18,7 @@ from pyro_dynogp.effects.nonlinear_feedback import (
 from pyro_dynogp.effects.output_nonlinearity import output_nonlinearity
 from pyro_dynogp.models.system import DynamicSystem
 from pyro_dynogp.models.variants import with_feedback
-from tests.discrepancy.made import SETTINGS, coloured, residuals_of
+from tests.discrepancy.made import SETTINGS, coloured, residuals_of, within_chance
 
 STEP, DAMPING, STIFFNESS = 0.05, 0.6, 4.0
 POLE = complex(-0.5 * DAMPING, np.sqrt(STIFFNESS - 0.25 * DAMPING**2))
@@ -61,7 +63,7 @@ class TestDetection:
         )  # fmt: skip
 
     def test_a_weak_spring_is_found(self):
-        r = self.seen(0, 1.0)
+        r = self.seen(0, 1.2)
         found = nonlinear_feedback(r, SETTINGS)
         assert found.p_value < 1e-4
         assert found.where == {"output": "speed"}
@@ -88,6 +90,47 @@ class TestDetection:
                              poles=np.array([POLE]))  # fmt: skip
             p.append(nonlinear_feedback(r, SETTINGS).p_value)
         assert np.mean(np.array(p) <= 0.05) <= 0.2
+
+    def governed(self, seed, drag, n=400):
+        """Speed x' = -2 x + u - drag x^3 that a controller makes follow steps."""
+        rng = np.random.default_rng(seed)
+        goal = np.repeat(rng.uniform(-1.0, 1.0, n // 40), 40)
+        u, y, x, total = np.empty(n), np.empty(n), 0.0, 0.0
+        decay = np.exp(-2.0 * STEP)
+        for k in range(n):
+            y[k] = x + 0.01 * rng.standard_normal()
+            total += STEP * (goal[k] - y[k])
+            u[k] = 2.0 * (goal[k] - y[k]) + 3.0 * total
+            x = decay * x + 0.5 * (1.0 - decay) * (u[k] - drag * x**3)
+        return u, y
+
+    def test_drag_under_a_controller_is_found_one_step_ahead(self):
+        u, y = self.governed(0, 1.0)
+        record = dgp.Record(STEP * np.arange(len(u)), u[:, None], y[:, None])
+        fit = dgp.fit(
+            dgp.LinearDynamicGP(1, pairs=1), record[:200], method="map", workers=1, progress=False
+        )
+        r = residuals.residuals_of(fit, record, settings=SETTINGS)
+        assert nonlinear_feedback(r, SETTINGS).p_value < 1e-4
+        order = np.random.default_rng(0).permutation(len(r))
+        blind = dataclasses.replace(r, innovations=r.innovations[order])
+        assert nonlinear_feedback(blind, SETTINGS).p_value > 1e-2
+        # Functions that a model has err beyond their data: no second test, and one p-value.
+        first, alone = (nonlinear_feedback(dataclasses.replace(one, linear=False), SETTINGS).p_value
+                        for one in (r, blind))  # fmt: skip
+        assert first == alone > 1e-2
+
+    def test_a_controller_does_not_make_a_linear_system_look_nonlinear(self):
+        p = []
+        for seed in range(40):
+            u, y = self.governed(seed, 0.0)
+            decay = np.exp(-2.0 * STEP)
+            mean = lfilter([0.0, 0.5 * (1.0 - decay)], [1.0, -decay], u)
+            r = residuals_of(y, mean, u[:, None], step=STEP, poles=np.array([-2.0 + 0.0j]))
+            r = dataclasses.replace(r, innovations=(y - mean) / 0.01)
+            p.append(nonlinear_feedback(r, SETTINGS).p_value)
+        assert within_chance(np.sum(np.array(p) <= 0.05), 40, 0.05)
+        assert np.mean(np.array(p) <= 0.5) > 0.2  # twice the smaller one, and no more
 
     def test_poles_at_zero_are_as_slow_as_the_record(self):
         r = dataclasses.replace(self.seen(1, 0.0), poles=np.array([0.0j, POLE]))

@@ -216,8 +216,8 @@ def test_which_optimizer_climbs():
     two = dgp.Cascade(1, (dgp.Dynamic(), dgp.Dynamic()))
     models = Linear(1), dgp.Wiener(1), dgp.NonlinearFeedback(1), two
     assert [optimizer_for(m) for m in models] == ["gauss-newton", "adam", "gauss-newton", "lbfgs"]
-    near = ["gauss-newton", "preconditioned", "gauss-newton", "preconditioned"]
-    assert [optimizer_near(m) for m in models] == near
+    assert {optimizer_near(m) for m in models} == {"gauss-newton"}
+    assert optimizer_near(dgp.Wiener(1, likelihood=dgp.StudentT())) == "preconditioned"
     for make in (Linear, dgp.NonlinearFeedback):
         assert optimizer_for(make(1, likelihood=dgp.StudentT())) == "lbfgs"
 

@@ -73,11 +73,20 @@ def test_the_mode_of_a_fit(map_fit, svi_fit, layered_fit):
         layered_fit.at_mode()
 
 
+NEWTON, OTHER = [2, 2, 2, 2, 12, 12, 12], [8, 8, 8, 8, 32, 32, 32]
+
+
 @pytest.mark.parametrize(
-    ("model", "steps"),
-    [(dgp.LinearDynamicGP(1), [2, 2, 2, 2, 12, 12, 12]), (dgp.Wiener(1), [8, 8, 8, 8, 32, 32, 32])],
+    ("base", "model", "steps"),
+    [
+        (dgp.LinearDynamicGP(1), dgp.LinearDynamicGP(1), NEWTON),
+        (dgp.Wiener(1), dgp.Wiener(1), NEWTON),
+        (dgp.LinearDynamicGP(1), dgp.Wiener(1), [8, 8, 8, 8, 12, 12, 12]),  # Adam first
+        (dgp.LinearDynamicGP(1), dgp.NonlinearFeedback(1), NEWTON),
+        (dgp.Wiener(1, likelihood=dgp.StudentT()), dgp.Wiener(1, likelihood=dgp.StudentT()), OTHER),
+    ],
 )
-def test_races_count_the_steps_of_the_optimizer_that_runs(monkeypatch, model, steps):
+def test_races_count_the_steps_of_the_optimizer_that_runs(monkeypatch, base, model, steps):
     given = []
 
     def again(fit, records, *, run, model=None):
@@ -85,7 +94,7 @@ def test_races_count_the_steps_of_the_optimizer_that_runs(monkeypatch, model, st
         return SimpleNamespace(model=model or fit.model, records=records, start_energies=[0.0])
 
     monkeypatch.setattr(refits, "refit", again)
-    refits.race(SimpleNamespace(model=model), [model] * 4, None, Run(0))
+    refits.race(SimpleNamespace(model=base), [model] * 4, None, Run(0))
     assert given == steps
 
 

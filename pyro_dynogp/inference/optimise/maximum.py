@@ -306,8 +306,11 @@ def optimizer_for(model: Model) -> Optimizer:
 
 
 def optimizer_near(model: Model) -> Optimizer:
-    """The optimizer that goes on from near an optimum."""
-    return "gauss-newton" if _suits_gauss_newton(model) else "preconditioned"
+    """The optimizer that goes on from near an optimum: Gauss-Newton under Gaussian noise.
+
+    Where functions are, their kernels are to be held: see `optimizer_for`.
+    """
+    return "gauss-newton" if has_innovations(model) else "preconditioned"
 
 
 def _suits_gauss_newton(model: Model) -> bool:
