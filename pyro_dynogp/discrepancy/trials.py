@@ -159,19 +159,30 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
 
     Where they differ in how they extrapolate what is right in one stretch may be luck: of those
     that are rehearsed only those count whose forecasts are no worse than those of the base held at
-    its last level, or else the last one, which leaves most open.
+    its last level, or else the last one, which leaves most open. Of others the third and later ones
+    join what the first two are, and take most of the time: where neither of these forecasts better
+    than the base they are not fitted.
     """
-    fits = [refit(trial.base, training, model=model, run=trial.run) for model in trial.models]
     fold, settings = trial.folds[0], trial.settings
-    kept = fits
+
+    def refitted(models: Sequence[Model]) -> list[Fit]:
+        return [refit(trial.base, training, model=model, run=trial.run) for model in models]
+
+    def density(fit: Fit) -> np.ndarray:
+        return held_out_density(fit, trial.record, fold, trial.score)
+
     if trial.compared == "rehearsed":
-        kept = lasting(fits, trial.base, trial.record, fold, trial.run, settings) or fits[-1:]
-    best, *others = kept
-    density = held_out_density(best, trial.record, fold, trial.score)
-    for one in others:
-        own = held_out_density(one, trial.record, fold, trial.score)
-        if certain(own - density, settings):
-            best, density = one, own
+        fits = refitted(trial.models)
+        fits = lasting(fits, trial.base, trial.record, fold, trial.run, settings) or fits[-1:]
+        rated = [(fit, density(fit)) for fit in fits]
+    else:
+        rated = [(fit, density(fit)) for fit in refitted(trial.models[:2])]
+        if trial.models[2:] and max(own.sum() for _, own in rated) > density(trial.base).sum():
+            rated += [(fit, density(fit)) for fit in refitted(trial.models[2:])]
+    best, highest = rated[0]
+    for one, own in rated[1:]:
+        if certain(own - highest, settings):
+            best, highest = one, own
     return best
 
 

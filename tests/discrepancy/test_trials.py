@@ -211,6 +211,43 @@ def test_a_step_has_substeps_where_they_are_better(record, monkeypatch, gains, h
     assert began[2:] == [tried.fit] * hidden
 
 
+@pytest.mark.parametrize(
+    ("levels", "fitted", "kept"),
+    [
+        ((5.0, -3.0, 9.0), 3, 2),
+        ((-3.0, 0.5, 9.0), 3, 2),
+        ((-3.0, 0.5, 1.0), 3, 1),  # certain is more than one nat
+        ((-3.0, -1.5, 9.0), 2, 1),  # neither forecasts better than the base
+        ((-1.0, 0.0, 9.0), 2, 0),
+    ],
+)
+def test_both_functions_together_are_fitted_where_one_of_them_helps(
+    record, monkeypatch, levels, fitted, kept
+):
+    plain = dgp.LinearDynamicGP(1, pairs=1)
+    models = (with_feedback(plain), with_feedback(plain, output=False, hidden=True),
+              with_feedback(plain, hidden=True))  # fmt: skip
+    made = []
+
+    def again(fit, training, *, model, run):
+        made.append(Made(model, levels[len(made)]))
+        return made[-1]
+
+    def density(fit, *_):
+        return np.full(9, fit.level / 9)
+
+    monkeypatch.setattr(trials, "refit", again)
+    monkeypatch.setattr(trials, "held_out_density", density)
+    monkeypatch.setattr(trials, "scored", lambda fit, *_: (density(fit), np.zeros((9, 1))))
+    monkeypatch.setattr(trials, "certain", lambda gain, settings: gain.sum() > 1.0)
+    fold = np.arange(N) >= TRAINING
+    trial = trials.Trial(models, record, (fold,), Made(plain, 0.0), 0, SETTINGS,
+                         compared="held out")  # fmt: skip
+    tried = trials.run(trial)
+    assert len(made) == fitted
+    assert tried.model == models[kept]
+
+
 def test_substeps_that_cannot_be_fitted_are_left(record, monkeypatch):
     model = with_feedback(dgp.LinearDynamicGP(1, pairs=1), output=False, hidden=True)
     fold = np.arange(N) >= TRAINING
