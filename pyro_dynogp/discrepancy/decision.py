@@ -71,8 +71,11 @@ def confirm(
     """
     refits = Refits(current, record, held_out, number, seed, settings, workers, progress, late)
     judged = refits.judge([one for one in candidates if kind_of(one[0])[1] == "forecast"])
+    if not _confirms(judged, level):
+        first = confirmed_together(refits, judged, level)
+        judged = [first if first and one.found is first.found else one for one in judged]
     waiting = [one for one in candidates if kind_of(one[0])[1] != "forecast"]
-    if not any(one.helps and one.found.q_value <= level for one in judged):
+    if not _confirms(judged, level):
         places = {id(found): place for place, (found, _) in enumerate(candidates)}
         judged = sorted([*judged, *refits.judge(waiting)], key=lambda one: places[id(one.found)])
         waiting = []
@@ -80,10 +83,6 @@ def confirm(
         Attempt(number, found.evidence, found.q_value, "not tried", STRUCTURE_FIRST)
         for found, _ in waiting
     ]
-    if not any(one.helps for one in judged):
-        first = confirmed_together(refits, judged, level)
-        if first is not None:
-            judged = [first if one.found is first.found else one for one in judged]
     better = _first_in_line([one for one in judged if one.helps], level)
     playing = refits.on_one_scale(better) if better and not refits.early else []
     if refits.early:
@@ -107,6 +106,11 @@ def confirm(
         fit=tried.fit if winner.kind[0] == "after" else None,
         ties=tuple(one for one in names if one != name),
     )
+
+
+def _confirms(judged: Sequence[Judged], level: float) -> bool:
+    """Whether one that the residual is certain of helps."""
+    return any(one.helps and one.found.q_value <= level for one in judged)
 
 
 def _cut_short(

@@ -39,7 +39,8 @@ def confirmed_together(refits: Refits, judged: Sequence[Judged], level: float) -
     larger gain that is returned, to be added first; the other one has the next round.
 
     Args:
-        refits: of the round. judged: candidates, none of which helps. level: of the tests.
+        refits: of the round. judged: candidates, of which none that is certain helps. level: of the
+            tests.
     """
     pairs = _pairs(refits, judged, level)
     together = refits.run(

@@ -285,6 +285,55 @@ def test_the_fit_of_the_winner_is_handed_on() -> None:
     assert len(done.fit.records[0]) == 240  # to what is not held out
 
 
+@pytest.mark.parametrize(
+    ("q", "helps", "pairs", "accepted"),
+    [
+        (1e-8, False, True, "extra input"),  # before noise is tried
+        (1e-8, True, False, "extra input"),
+        (0.5, True, True, "heavy tails"),  # what helps by luck does not keep pairs from it
+    ],
+)
+def test_pairs_are_tried_where_no_structure_is_certain(
+    monkeypatch: pytest.MonkeyPatch, q: float, helps: bool, pairs: bool, accepted: str
+) -> None:
+    one = helping(effects.ExtraInput(), 1e-4, q)
+    noise = helping(effects.HeavyTails(), 1e-4, 1e-4)
+    judged = [replace(one, helps=helps)]
+    asked: list[Any] = []
+
+    class Refits:
+        early, model = False, MODEL
+
+        def __init__(self, *given: Any) -> None:
+            del given
+
+        def judge(self, candidates: Any) -> Any:
+            return judged if candidates and candidates[0][0] is one.found else [noise]
+
+        def on_one_scale(self, better: Any) -> Any:
+            return better
+
+        def with_substeps(self, winner: Any) -> Any:
+            return winner.tried
+
+    def together(refits: Any, judged: Any, level: float) -> Any:
+        asked.append(judged)
+        return replace(judged[0], helps=True)
+
+    monkeypatch.setattr("pyro_dynogp.discrepancy.decision.Refits", Refits)
+    monkeypatch.setattr("pyro_dynogp.discrepancy.decision.confirmed_together", together)
+    given: Any = (None, None, np.zeros(0))
+    done = confirm(
+        [(one.found, ()), (noise.found, ())], *given, number=1, seed=0, level=0.05,
+        settings=SETTINGS,
+    )  # fmt: skip
+    assert bool(asked) is pairs
+    assert done.attempt is not None
+    assert done.attempt.name == accepted
+    tried = {attempt.name: attempt.decision for attempt in done.attempts}
+    assert (tried["heavy tails"] == "not tried") is (q <= 0.05)
+
+
 @pytest.mark.parametrize(("q", "decision"), [(1e-8, "not tried"), (0.5, "rejected")])
 def test_noise_is_tried_where_no_structure_is_certain(q: float, decision: str) -> None:
     record = machine(weight=0.3)
