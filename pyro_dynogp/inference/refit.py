@@ -20,6 +20,7 @@ from pyro_dynogp.inference.methods.optima import POLISH, Hyperparameters, poster
 from pyro_dynogp.inference.methods.svi import Schedule
 from pyro_dynogp.inference.optimise.maximum import (
     Effort,
+    Optimizer,
     maximise,
     optimizer_for,
     optimizer_near,
@@ -175,14 +176,18 @@ def _again(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     optimizer = "adam" if adam else optimizer_near(model)
     optima = maximise(
         model, problem.records, optima_of(fit), run, optimizer=optimizer, steps=steps,
-        effort=AGAIN, held=_held(model),
+        effort=AGAIN, held=_held(model, optimizer),
     )  # fmt: skip
     return _settled(problem, optima, run)
 
 
-def _held(model: Model) -> tuple[str, ...]:
-    """Sites that keep what is learnt while Gauss-Newton climbs: kernels, see `optimizer_near`."""
-    return kernel_sites(model) if optimizer_near(model) == "gauss-newton" else ()
+def _held(model: Model, optimizer: Optimizer) -> tuple[str, ...]:
+    """Sites that keep what is learnt: kernels while Gauss-Newton climbs, see `optimizer_near`.
+
+    With feedback whatever climbs: their kernels are those of the evidence, see `_settled`.
+    """
+    held = model.has_feedback or optimizer == "gauss-newton"
+    return kernel_sites(model) if held else ()
 
 
 def _settled(problem: Problem, optima: list[Optimum], run: Run) -> list[Optimum]:
@@ -206,9 +211,10 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     if excerpt is None:
         return _settled(problem, _climbed(fit, problem, run), run)
     (best, *_) = _climbed(fit, excerpt, run)
+    optimizer = optimizer_near(target)
     optima = maximise(
-        target, problem.records, [best.values], run, optimizer=optimizer_near(target),
-        steps=LAYERED_STEPS, effort=AGAIN, held=_held(target),
+        target, problem.records, [best.values], run, optimizer=optimizer, steps=LAYERED_STEPS,
+        effort=AGAIN, held=_held(target, optimizer),
     )  # fmt: skip
     return _settled(problem, optima, run)
 
@@ -235,9 +241,10 @@ def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     effort = LOOPED if target.has_feedback else EXTENDED
 
     def climbed(model: Model, points: Sequence[Values], usual: int) -> list[Optimum]:
+        optimizer = optimizer_near(model)
         return maximise(
-            model, records, points, run, optimizer=optimizer_near(model), steps=run.steps or usual,
-            effort=effort, held=_held(model),
+            model, records, points, run, optimizer=optimizer, steps=run.steps or usual,
+            effort=effort, held=_held(model, optimizer),
         )  # fmt: skip
 
     if target.is_linear:

@@ -55,6 +55,30 @@ def test_a_cascade_keeps_its_optima(bent):
     assert len(again.draws["f_values"]) == 20
 
 
+@pytest.mark.parametrize("method", ["map", "svi"])
+def test_kernels_are_held_while_gauss_newton_climbs_and_not_by_adam(bent, monkeypatch, method):
+    fit = dgp.fit(wiener(), bent, **{**FAST, "method": "svi"})
+    fit = fit if method == "svi" else fit.at_mode()
+    climbs = []
+    maximise = refits.maximise
+
+    def spied(*args, **options):
+        climbs.append((options["optimizer"], bool(options["held"])))
+        return maximise(*args, **options)
+
+    monkeypatch.setattr(refits, "maximise", spied)
+    refit(fit, bent, run=Run(0, workers=1, steps=3))
+    assert climbs == [("gauss-newton", True) if method == "map" else ("adam", False)]
+
+
+def test_kernels_in_feedback_are_held_whatever_climbs():
+    for likelihood in (None, dgp.StudentT()):
+        options = {} if likelihood is None else {"likelihood": likelihood}
+        model = dgp.NonlinearFeedback(1, **options)
+        assert refits._held(model, refits.optimizer_near(model)) == refits.kernel_sites(model) != ()
+    assert refits._held(dgp.LinearDynamicGP(1), "gauss-newton") == ()
+
+
 def test_what_is_refused(map_fit, layered_fit, record):
     with pytest.raises(ValueError, match="fit: expected a fit whose trajectories are integrated"):
         refit(layered_fit, layered_fit.records)

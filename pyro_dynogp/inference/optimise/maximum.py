@@ -300,7 +300,7 @@ def optimizer_for(model: Model) -> Optimizer:
     scales and short lengthscales that make the functions less certain than they are. With feedback
     kernels are found by the evidence afterwards, and L-BFGS stops far below the top.
     """
-    if _suits_gauss_newton(model):
+    if has_innovations(model) and (model.is_linear or model.has_feedback):
         return "gauss-newton"
     return "adam" if model.has_function and not model.has_feedback else "lbfgs"
 
@@ -311,7 +311,3 @@ def optimizer_near(model: Model) -> Optimizer:
     Where functions are, their kernels are to be held: see `optimizer_for`.
     """
     return "gauss-newton" if has_innovations(model) else "preconditioned"
-
-
-def _suits_gauss_newton(model: Model) -> bool:
-    return has_innovations(model) and (model.is_linear or model.has_feedback)
