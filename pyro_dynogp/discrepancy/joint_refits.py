@@ -10,7 +10,6 @@ from pyro_dynogp.discrepancy.held_out import certain
 from pyro_dynogp.discrepancy.judged import SPREAD, Judged, Kind, judge
 from pyro_dynogp.discrepancy.refits import Refits
 from pyro_dynogp.discrepancy.search import extended_by
-from pyro_dynogp.discrepancy.trials import Trial, Tried
 from pyro_dynogp.models.variants import Model
 
 # Effects of which pairs are tried.
@@ -21,14 +20,14 @@ MOST = 3
 class Pair:
     """Two effects, variants of the model with both, and where these are scored."""
 
-    one: Judged
-    other: Judged
+    members: tuple[Judged, Judged]
     models: tuple[Model, ...]
 
     @property
     def kind(self) -> Kind:
         """Spread over the record where one of them acts at an instant."""
-        return max(self.one.kind, self.other.kind, key=lambda kind: kind == SPREAD)
+        first, second = self.members
+        return SPREAD if second.kind == SPREAD else first.kind
 
 
 def confirmed_together(refits: Refits, judged: Sequence[Judged], level: float) -> Judged | None:
@@ -44,25 +43,35 @@ def confirmed_together(refits: Refits, judged: Sequence[Judged], level: float) -
     """
     pairs = _pairs(refits, judged, level)
     together = refits.run(
-        {k: refits.trial(one.models, one.kind, one.other.found) for k, one in enumerate(pairs)},
+        {
+            k: refits.trial(one.models, one.kind, one.members[1].found)
+            for k, one in enumerate(pairs)
+        },
         "joint refits",
     )
-    alone = _alone(refits, pairs)
+    spread = refits.on_spread_blocks(
+        [one for pair in pairs if pair.kind == SPREAD for one in pair.members]
+    )
     if refits.early:
         return None
     best, largest = None, 0.0
     for k, pair in enumerate(pairs):
         tried, base = together[k], refits.results["", pair.kind]
-        both = judge(pair.other.found, pair.kind, tried, base, refits.number, refits.settings)
-        members = [alone[id(one), pair.kind] for one in (pair.one, pair.other)]
-        if not both.helps or any(one.failure for one in members):
+        both = judge(pair.members[1].found, pair.kind, tried, base, refits.number, refits.settings)
+        alone = [
+            one.tried if one.kind == pair.kind else spread[repr(one.tried.model)]
+            for one in pair.members
+        ]
+        if not both.helps or any(one.failure for one in alone):
             continue
-        more = [tried.densities - one.densities for one in members]
+        more = [tried.densities - one.densities for one in alone]
         if not all(certain(gain, refits.settings) for gain in more):
             continue
         if both.attempt.gain > largest:
-            first = pair.one if more[1].sum() >= more[0].sum() else pair.other
-            best, largest = _first_of(pair, first, both), both.attempt.gain
+            first, second = pair.members
+            if more[1].sum() < more[0].sum():
+                first, second = second, first
+            best, largest = _together_with(second, first, both), both.attempt.gain
     return best
 
 
@@ -78,28 +87,13 @@ def _pairs(refits: Refits, judged: Sequence[Judged], level: float) -> list[Pair]
         for first, second in ((one, other), (other, one)):
             models, _ = extended_by(second.found, first.tried.model, refits.record)
             if models:
-                pairs.append(Pair(first, second, tuple(models)))
+                pairs.append(Pair((first, second), tuple(models)))
                 break
     return pairs
 
 
-def _alone(refits: Refits, pairs: Sequence[Pair]) -> dict[tuple[int, Kind], Tried]:
-    """Every member of a pair by itself, scored as the pair is."""
-    found: dict[tuple[int, Kind], Tried] = {}
-    missing: dict[tuple[int, Kind], Trial] = {}
-    for pair in pairs:
-        for one in (pair.one, pair.other):
-            if one.kind == pair.kind:
-                found[id(one), pair.kind] = one.tried
-            else:
-                trial = refits.trial((one.tried.model,), pair.kind, one.found)
-                missing[id(one), pair.kind] = trial
-    return found | refits.run(missing, "refits once more")
-
-
-def _first_of(pair: Pair, first: Judged, both: Judged) -> Judged:
-    """An effect that is confirmed by what it gains together with another one."""
-    second = pair.other if first is pair.one else pair.one
+def _together_with(second: Judged, first: Judged, both: Judged) -> Judged:
+    """The first effect, confirmed by what it gains together with the second."""
     own, joint = first.attempt, both.attempt
     reason = (
         f"held-out elpd {own.gain:+.1f} +- {own.gain_error:.1f} nats, together with "

@@ -53,10 +53,10 @@ def judge(
     refits gain by chance.
     """
     evidence, q = found.evidence, found.q_value
-    errors = settings.standard_errors
+    enough = settings
     if evidence.p_value > settings.unsure:
-        errors = max(errors, settings.unsure_errors)
-    enough = replace(settings, standard_errors=errors)
+        errors = max(settings.standard_errors, settings.unsure_errors)
+        enough = replace(settings, standard_errors=errors)
     if tried.failure or base.failure:
         reason = f"could not be fitted: {tried.failure or base.failure}"
         return Judged(found, kind, tried, Attempt(number, evidence, q, "rejected", reason))

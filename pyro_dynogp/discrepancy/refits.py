@@ -110,16 +110,20 @@ class Refits:
         """The same candidates scored alike, since gains on different densities do not compare."""
         if len({one.kind for one in better}) == 1:
             return list(better)
-        others = [one for one in better if one.kind != SPREAD]
-        more = {
-            repr(one.tried.model): self.trial((one.tried.model,), SPREAD, one.found)
-            for one in others
-        }
-        again = self.run(more, "refits once more")
+        spread = self.on_spread_blocks(better)
         if self.early:
             return list(better)
         return [
             one if one.kind == SPREAD
-            else self.judged(one.found, SPREAD, again[repr(one.tried.model)])
+            else self.judged(one.found, SPREAD, spread[repr(one.tried.model)])
             for one in better
         ]  # fmt: skip
+
+    def on_spread_blocks(self, several: Sequence[Judged]) -> dict[str, Tried]:
+        """What is scored otherwise, on blocks spread over the record instead, by its model."""
+        more = {
+            repr(one.tried.model): self.trial((one.tried.model,), SPREAD, one.found)
+            for one in several
+            if one.kind != SPREAD
+        }
+        return self.run(more, "refits once more")

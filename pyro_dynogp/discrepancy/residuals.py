@@ -49,11 +49,12 @@ def free_run_of(fit: Fit, record: Record, *, seed: int, settings: LoopSettings) 
     def run(spread: Fit) -> tuple[np.ndarray, np.ndarray]:
         return _free_run(fit, spread, prepared, begin, settings.draws, seed)
 
-    if fit.method == "map" and fit.model.has_function and not fit.model.has_feedback:
+    if fit.method != "map":
+        mean, component = run(fit)
+    elif fit.model.has_function and not fit.model.has_feedback:
         mean, component = _straight(run, fit, settings.draws, seed)
     else:
-        spread = fit if fit.method != "map" else _spread(fit, settings.draws, seed)
-        mean, component = run(spread)
+        mean, component = run(_spread(fit, settings.draws, seed))
     chosen = np.linspace(0, len(component) - 1, min(settings.draws, len(component))).astype(int)
     drawn = component[chosen]
     return FreeRun(begin, mean, drawn - drawn.mean(0))

@@ -50,9 +50,7 @@ class SearchState:
         reported: what no block mends, by the last tests.
         left: what is left, in words, by the last tests. notes: what else there is to say.
         early: whether the time limit was passed before the search came to its end.
-        dropped: whether nothing was found to add, and the model as given forecasts held-out data
-            better without its process noise: the last fit is that one. left_without: what it
-            leaves, in words.
+        left_without: what is left without process noise, where rounds began again with it.
     """
 
     rounds: SearchContext
@@ -74,7 +72,6 @@ class SearchState:
     left: tuple[str, ...] = ()
     notes: list[str] = field(default_factory=list)
     early: bool = False
-    dropped: bool = False
     left_without: tuple[str, ...] = ()
     _looked: Tested | None = None
     _omnibus: Sequence[float] = ()
@@ -124,9 +121,13 @@ class SearchState:
                 break
         if not self.early:
             self.doubt()
-        if (self.quiet or self.returned) and not (self.accepted or self.early):
-            self.dropped = True
+        if self.dropped:
             self.fits.append(self.plain)
+
+    @property
+    def dropped(self) -> bool:
+        """Whether nothing was added, and the last fit is the model without its process noise."""
+        return (self.quiet or self.returned) and not (self.accepted or self.early)
 
     def stopped(self) -> bool:
         """Whether the time limit was passed before the search came to its end."""

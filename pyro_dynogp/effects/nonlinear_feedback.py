@@ -20,6 +20,7 @@ from pyro_dynogp.statistics.bootstrap import Scan
 from pyro_dynogp.statistics.detecting import lasting
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
 from pyro_dynogp.statistics.pictures import about, against, evidence, labelled
+from pyro_dynogp.statistics.regression import with_past
 from pyro_dynogp.statistics.responses import filtered, standardised
 from pyro_dynogp.statistics.serial import one_step_sd
 from pyro_dynogp.statistics.settings import LoopSettings
@@ -96,7 +97,7 @@ def _one_step_ahead(r: Residuals, settings: LoopSettings, seed: int) -> Scan:
     )
     last = _earlier(y, 1)
     shapes = [*_shapes(last), *_shapes(last - _earlier(y, 2))]
-    variants = [np.column_stack([shape, _earlier(shape, 1)]) for shape in shapes]
+    variants = [with_past(shape) for shape in shapes]
     lags = [_earlier(y, k + 1) for k in range(LAGS)]
     lags += [_earlier(r.inputs, k) for k in range(LAGS)]
     linear = np.column_stack(lags)

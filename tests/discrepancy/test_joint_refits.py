@@ -13,6 +13,7 @@ from pyro_dynogp import effects
 from pyro_dynogp.discrepancy import joint_refits
 from pyro_dynogp.discrepancy.joint_refits import confirmed_together
 from pyro_dynogp.discrepancy.judged import Judged, judge, kind_of
+from pyro_dynogp.discrepancy.refits import Refits
 from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.discrepancy.trials import Tried
 from pyro_dynogp.statistics.evidence import Evidence
@@ -58,6 +59,8 @@ class Trials:
             key: self.alone[name] if models[0] == MODEL else self.both
             for key, (models, _, name) in tasks.items()
         }
+
+    on_spread_blocks = Refits.on_spread_blocks
 
     def candidate(self, effect: effects.Effect, q: float) -> Judged:
         found = Found(effect, Evidence(effect.name, 5.0, q / 10.0, 1.0, 0.1), q)

@@ -180,7 +180,8 @@ def test_runs_of_functions_are_linear_in_the_parameters(sensor):
     slopes = (up - down) / 2e-4
     expected = np.square(slopes.T @ root).sum(1)
     late = slice(60, None)
-    np.testing.assert_allclose(found[late], expected[late], rtol=0.15)
+    # 3000 draws tell a variance to sqrt(2 / 3000) = 2.6 %; five of these.
+    np.testing.assert_allclose(found[late], expected[late], rtol=0.13)
     # A posterior spreads simulations by less than the noise; draws as they are do not.
     assert found[late].mean() < 0.02**2
     loose = fit.with_draws(normal.draws(200, 0).values)

@@ -166,6 +166,18 @@ def test_models_without_process_noise_stay_as_they_are():
     assert not without_process_noise(dgp.LinearDynamicGP(1)).layers[0].process_noise
 
 
+def refitted_by(monkeypatch, again):
+    """Refits are made by `again`, and gain their level in nine samples; certain is one nat."""
+
+    def density(fit, *_):
+        return np.full(9, fit.level / 9)
+
+    monkeypatch.setattr(trials, "refit", again)
+    monkeypatch.setattr(trials, "held_out_density", density)
+    monkeypatch.setattr(trials, "scored", lambda fit, *_: (density(fit), np.zeros((9, 1))))
+    monkeypatch.setattr(trials, "certain", lambda gain, settings: gain.sum() > 1.0)
+
+
 @pytest.mark.parametrize(
     ("gains", "hidden", "substeps"),
     [
@@ -188,13 +200,7 @@ def test_a_step_has_substeps_where_they_are_better(record, monkeypatch, gains, h
         began.append(fit)
         return made[-1]
 
-    def density(fit, *_):
-        return np.full(9, fit.level / 9)
-
-    monkeypatch.setattr(trials, "refit", again)
-    monkeypatch.setattr(trials, "held_out_density", density)
-    monkeypatch.setattr(trials, "scored", lambda fit, *_: (density(fit), np.zeros((9, 1))))
-    monkeypatch.setattr(trials, "certain", lambda gain, settings: gain.sum() > 1.0)
+    refitted_by(monkeypatch, again)
     fold = np.arange(N) >= TRAINING
     base = SimpleNamespace(model=plain)
     trial = trials.Trial(models, record, (fold,), base, 0, SETTINGS, compared="held out")
@@ -233,13 +239,7 @@ def test_both_functions_together_are_fitted_where_one_of_them_helps(
         made.append(Made(model, levels[len(made)]))
         return made[-1]
 
-    def density(fit, *_):
-        return np.full(9, fit.level / 9)
-
-    monkeypatch.setattr(trials, "refit", again)
-    monkeypatch.setattr(trials, "held_out_density", density)
-    monkeypatch.setattr(trials, "scored", lambda fit, *_: (density(fit), np.zeros((9, 1))))
-    monkeypatch.setattr(trials, "certain", lambda gain, settings: gain.sum() > 1.0)
+    refitted_by(monkeypatch, again)
     fold = np.arange(N) >= TRAINING
     trial = trials.Trial(models, record, (fold,), Made(plain, 0.0), 0, SETTINGS,
                          compared="held out")  # fmt: skip

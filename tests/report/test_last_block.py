@@ -122,6 +122,13 @@ def kept() -> Any:
     return close(fitted(record), record, effects=(effects.Drift(),))
 
 
+def page_of(report: Any, folder: Any) -> tuple[str, str]:
+    """The page of a report, and its headline."""
+    report.to_html(folder / "report.html")
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    return page, page.partition("<h1>")[2].partition("</h1>")[0]
+
+
 def test_where_effects_do_harm_the_model_before_is_the_fit(kept: Any, tmp_path: Any) -> None:
     assert [one.name for one in kept.effects] == ["drift"]
     assert kept.after["rmse"] > 1.05 * kept.before["rmse"]
@@ -137,9 +144,7 @@ def test_where_effects_do_harm_the_model_before_is_the_fit(kept: Any, tmp_path: 
     assert "Rely on the model before (report.fit)" in first
     assert any("What was added does harm on the last block" in line for line in others)
     assert kept.to_dict()["model_kept"] is True
-    kept.to_html(tmp_path / "report.html")
-    page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    headline = page.partition("<h1>")[2].partition("</h1>")[0]
+    page, headline = page_of(kept, tmp_path)
     assert headline.startswith("One effect was named, but the model is kept as it was")
     assert "Rely on the model before" in page
 
@@ -180,9 +185,7 @@ def test_of_two_effects_the_one_that_does_harm_is_left_out(tmp_path: Any) -> Non
     assert said.endswith("; left out of report.fit")
     assert f"   {said}" in str(report).splitlines()
     assert "left out" not in report.said_of_last_block(first)
-    report.to_html(tmp_path / "report.html")
-    page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    headline = page.partition("<h1>")[2].partition("</h1>")[0]
+    page, headline = page_of(report, tmp_path)
     assert headline.startswith("One effect was missing from the model and added: extra in")
     assert "drift named too, but left out" in headline
     assert said in page
@@ -217,9 +220,7 @@ def test_where_nothing_is_missing_but_noise_costs_forecasts_it_is_left_out(
     assert report.headline.endswith("without its process noise, and is now without it.")
     assert report.warnings[0].startswith("Without process noise the last block is forecast so")
     assert report.to_dict()["noise_dropped"] is True
-    report.to_html(tmp_path / "report.html")
-    page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    headline = page.partition("<h1>")[2].partition("</h1>")[0]
+    page, headline = page_of(report, tmp_path)
     assert headline.startswith("No effect was found that the model lacks; ")
     assert "of the forecast goes from" in page
 
@@ -243,18 +244,18 @@ def test_what_is_left_is_said_of_the_model_that_the_report_gives(
 ) -> None:
     """Without its noise the model leaves something, with it nothing."""
     monkeypatch.setattr(last_block.Compared, "does_harm", harm)
-    monkeypatch.setattr(
-        SearchContext, "left",
-        lambda self, looked: ((), (1.0,)) if has_process_noise(self.looked_at)
-        else (("something",), ()),
-    )  # fmt: skip
+    looked_at: list[dgp.Fit] = []
     look = SearchContext.look
 
     def looking(self: SearchContext, fit: dgp.Fit, *args: Any) -> Any:
-        self.looked_at = fit.model  # type: ignore[attr-defined]
+        looked_at.append(fit)
         return look(self, fit, *args)
 
+    def left(self: SearchContext, looked: Any) -> Any:
+        return ((), (1.0,)) if has_process_noise(looked_at[-1].model) else (("something",), ())
+
     monkeypatch.setattr(SearchContext, "look", looking)
+    monkeypatch.setattr(SearchContext, "left", left)
     report = close(noisy(hiding), hiding)
     assert report.noise_dropped is not harm
     assert report.left == (() if harm else ("something",))
