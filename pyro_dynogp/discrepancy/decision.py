@@ -18,7 +18,7 @@ from pyro_dynogp.fitting import Fit
 from pyro_dynogp.models.variants import Model
 from pyro_dynogp.statistics.settings import LoopSettings
 
-STRUCTURE_FIRST = "what certainly lies between inputs and output comes first"
+CERTAIN_FIRST = "what certainly lies between inputs and output comes first"
 LATE = "the time limit was passed"
 
 
@@ -60,7 +60,9 @@ def confirm(
 ) -> Confirmed:
     """Add each candidate alone, refit, and compare the densities of what was held out.
 
-    What belongs to the noise is tried where no structure is certain: its lack looks like noise.
+    Structure of which the residual is certain is tried first. Where that helps only relatives of it
+    are tried beside it. What belongs to the noise is tried where no structure is certain: its lack
+    looks like noise.
 
     Args:
         candidates: from `candidates_of`. current: fit of the model that is extended, to what is not
@@ -70,18 +72,26 @@ def confirm(
             nothing: what was refitted is not compared with all others.
     """
     refits = Refits(current, record, held_out, number, seed, settings, workers, progress, late)
-    judged = refits.judge([one for one in candidates if kind_of(one[0])[1] == "forecast"])
-    if not _confirms(judged, level):
+    structure = [one for one in candidates if kind_of(one[0])[1] == "forecast"]
+    sure = [one for one in structure if one[0].q_value <= level]
+    judged = refits.settled(refits.judge(sure), level)
+    certain = {one.found.effect.family for one in judged if one.helps}
+    judged += refits.judge([
+        one for one in structure
+        if one not in sure and (not certain or one[0].effect.family in certain)
+    ])  # fmt: skip
+    if not certain:
         first = confirmed_together(refits, judged, level)
         judged = [first if first and one.found is first.found else one for one in judged]
-    waiting = [one for one in candidates if kind_of(one[0])[1] != "forecast"]
     if not _confirms(judged, level):
-        places = {id(found): place for place, (found, _) in enumerate(candidates)}
-        judged = sorted([*judged, *refits.judge(waiting)], key=lambda one: places[id(one.found)])
-        waiting = []
+        judged += refits.judge([one for one in candidates if one not in structure])
+    places = {id(found): place for place, (found, _) in enumerate(candidates)}
+    judged = sorted(judged, key=lambda one: places[id(one.found)])
+    done = [id(one.found) for one in judged]
     untried = [
-        Attempt(number, found.evidence, found.q_value, "not tried", STRUCTURE_FIRST)
-        for found, _ in waiting
+        Attempt(number, found.evidence, found.q_value, "not tried", CERTAIN_FIRST)
+        for found, _ in candidates
+        if id(found) not in done
     ]
     better = _first_in_line([one for one in judged if one.helps], level)
     playing = refits.on_one_scale(better) if better and not refits.early else []

@@ -24,13 +24,18 @@ SPREAD: Kind = ("spread", "forecast")
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """A candidate, its refit, its gain over the model without it, and whether that is enough."""
+    """A candidate, its refit, its gain over the model without it, and whether that is enough.
+
+    Attributes:
+        helps: whether it gains for certain. harms: whether its forecasts are certainly worse.
+    """
 
     found: Found
     kind: Kind
     tried: Tried
     attempt: Attempt
     helps: bool = False
+    harms: bool = False
 
 
 def kind_of(found: Found) -> Kind:
@@ -81,7 +86,7 @@ def judge(
         reason += f"; about {wanted} samples like these {len(d)} would settle it"
     decision: Decision = "nearly" if wanted else "rejected"
     attempt = Attempt(number, evidence, q, decision, reason, gain, error, tried.seconds)
-    return Judged(found, kind, tried, attempt, helps)
+    return Judged(found, kind, tried, attempt, helps, harms)
 
 
 def enough_samples(gain: float, error: float, count: int, settings: LoopSettings) -> int:

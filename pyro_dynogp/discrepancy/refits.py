@@ -88,7 +88,8 @@ class Refits:
         tasks = {("", kind): self.trial((self.model,), kind, None) for kind in kinds}
         for (found, variants), kind in zip(candidates, kinds, strict=True):
             tasks[repr(variants), kind] = self.trial(variants, kind, found)
-        self.results.update(self.run(tasks, "refits"))
+        new = {key: trial for key, trial in tasks.items() if key not in self.results}
+        self.results.update(self.run(new, "refits"))
         return [
             self.judged(found, kind, self.results[repr(variants), kind])
             for (found, variants), kind in zip(candidates, kinds, strict=True)
@@ -120,10 +121,42 @@ class Refits:
         ]  # fmt: skip
 
     def on_spread_blocks(self, several: Sequence[Judged]) -> dict[str, Tried]:
-        """What is scored otherwise, on blocks spread over the record instead, by its model."""
+        """What is scored otherwise, on blocks spread over the record instead, by its model.
+
+        Against the model without it, which is scored there, too.
+        """
         more = {
             repr(one.tried.model): self.trial((one.tried.model,), SPREAD, one.found)
             for one in several
             if one.kind != SPREAD
         }
-        return self.run(more, "refits once more")
+        if more and ("", SPREAD) not in self.results:
+            more[""] = self.trial((self.model,), SPREAD, None)
+        found = self.run(more, "refits once more")
+        if "" in found:
+            self.results["", SPREAD] = found.pop("")
+        return found
+
+    def settled(self, judged: Sequence[Judged], level: float) -> list[Judged]:
+        """What may be worth most on the last block, scored on blocks of the whole record as well.
+
+        Where the residual is certain of an effect, and its gain is more than that of all that
+        help, if short of its error, most of the record is held out instead, a part at a time.
+        """
+        most = max((one.attempt.gain for one in judged if one.helps), default=0.0)
+        unsettled = [
+            one for one in judged
+            if not (one.helps or one.harms) and one.kind != SPREAD and one.attempt.gain > most
+            and one.found.q_value <= level
+        ]  # fmt: skip
+        spread = self.on_spread_blocks(unsettled)
+        if self.early:
+            return list(judged)
+
+        def again(one: Judged) -> Judged:
+            two = self.judged(one.found, SPREAD, spread[repr(one.tried.model)])
+            reason = f"{one.attempt.reason}; on blocks of the whole record {two.attempt.reason}"
+            kept = two if two.helps else one
+            return replace(kept, attempt=replace(kept.attempt, reason=reason))
+
+        return [again(one) if one in unsettled else one for one in judged]

@@ -308,7 +308,14 @@ def test_pairs_are_tried_where_no_structure_is_certain(
             del given
 
         def judge(self, candidates: Any) -> Any:
-            return judged if candidates and candidates[0][0] is one.found else [noise]
+            tried = [found for found, _ in candidates]
+            return [
+                *(judged if one.found in tried else []),
+                *([noise] if noise.found in tried else []),
+            ]
+
+        def settled(self, judged: Any, level: float) -> Any:
+            return judged
 
         def on_one_scale(self, better: Any) -> Any:
             return better
@@ -469,7 +476,7 @@ def test_substeps_are_tried_of_the_winner_alone(
         return divided
 
     monkeypatch.setattr(refits, "with_substeps", with_substeps)
-    looks = iter([False, True])
+    looks = iter([False, False, True])  # what is certain, its relative, and substeps
     done = confirm(
         tasks, fit, record[:360], np.arange(360) >= 240, number=1, seed=0, level=0.05,
         settings=SETTINGS, workers=4, late=(lambda: next(looks)) if over else None,

@@ -74,10 +74,10 @@ def test_a_search_that_ends_before_its_first_round_claims_nothing(
 def test_a_round_that_is_cut_short_adds_nothing(
     clock: Clock, monkeypatch: pytest.MonkeyPatch, planted: Any
 ) -> None:
-    """The model itself is refitted for both kinds of scores, then the first candidate alone."""
+    """Of what the residual is certain of, the first candidate alone is refitted in time."""
     passing(monkeypatch, clock, refits, "run", 40.0)
     fit, record = planted
-    report = close(fit, record, effects=(*FEW, effects.Drift()), time_limit=110.0, level=0.9)
+    report = close(fit, record, effects=(*FEW, effects.Drift()), time_limit=70.0, level=0.9)
     assert report.effects == ()
     assert report.outcome == "search ended early"
     assert report.fit is report.base

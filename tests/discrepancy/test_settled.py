@@ -1,0 +1,177 @@
+"""Gains that the last block leaves open are settled on blocks of the whole record."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import pyro_dynogp as dgp
+from pyro_dynogp import effects
+from pyro_dynogp.discrepancy import decision
+from pyro_dynogp.discrepancy.decision import confirm
+from pyro_dynogp.discrepancy.judged import SPREAD, Judged, judge, kind_of
+from pyro_dynogp.discrepancy.refits import Refits
+from pyro_dynogp.discrepancy.trials import Tried
+from tests.discrepancy.made import SETTINGS
+from tests.discrepancy.test_decision import spoken_for
+from tests.discrepancy.test_joint_refits import SAMPLES, tried
+
+MODEL = dgp.LinearDynamicGP(inputs=1, pairs=1)
+INPUT, DELAY, STEP = effects.ExtraInput(), effects.DeadTime(), effects.LevelShift()
+# A gain of 3 standard errors on blocks of the whole record, one of 1, and none.
+WELL, HARDLY, NOTHING = tried(60.0, 20.0), tried(20.0, 20.0), tried(0.0, failure="no")
+
+
+class Scored(Refits):
+    """Refits that come to what they are told on blocks of the whole record."""
+
+    spread: Tried
+    asked: list[str]
+    late_then: bool = False
+
+    def run(self, tasks: dict[Any, Any], label: str) -> dict[Any, Tried]:
+        self.asked += [key for key in tasks if key]
+        self.early = self.late_then
+        return {key: self.spread if key else tried(0.0, 1e-9) for key in tasks}
+
+
+def refits(spread: Tried) -> Scored:
+    current: Any = type("Current", (), {"model": MODEL})
+    record: Any = range(480)
+    one = Scored(current, record, np.arange(480) >= 240, 1, 0, SETTINGS, 1, False)
+    one.spread, one.asked = spread, []
+    return one
+
+
+def candidate(
+    effect: effects.Effect, gain: float, error: float, *, q: float = 1e-4, worse: float = 1.0
+) -> Judged:
+    """With a gain on the last block, its error, and how much larger errors of forecasts are."""
+    found = spoken_for(effect, q / 10.0, q)
+    before = np.resize([1.0, -1.0], SAMPLES)[:, None]
+    base = Tried(MODEL, np.zeros(SAMPLES), 0.0, errors=before)
+    result = tried(gain, error)
+    one = Tried(MODEL, result.densities, 0.0, errors=worse * before)
+    return judge(found, kind_of(found), one, base, 1, SETTINGS)
+
+
+@pytest.mark.parametrize(
+    ("gain", "error", "q", "asked"),
+    [
+        (19.0, 10.0, 1e-4, True),  # nearly
+        (1.0, 10.0, 1e-4, True),
+        (-1.0, 10.0, 1e-4, False),
+        (30.0, 10.0, 1e-4, False),  # helps as it is
+        (19.0, 10.0, 0.049, True),
+        (19.0, 10.0, 0.051, False),  # the residual is not certain of it
+    ],
+)
+def test_what_the_last_block_leaves_open_is_scored_on_the_whole_record(
+    gain: float, error: float, q: float, asked: bool
+) -> None:
+    one, scored = candidate(INPUT, gain, error, q=q), refits(WELL)
+    (settled,) = scored.settled([one], 0.05)
+    assert bool(scored.asked) is asked
+    assert settled.helps is (asked or gain > 20.0)
+    if asked:
+        assert settled.kind == SPREAD
+        assert one.attempt.reason in settled.attempt.reason
+        assert "on blocks of the whole record held-out elpd +60.0" in settled.attempt.reason
+    else:
+        assert settled is one
+
+
+def test_what_does_not_gain_there_either_stays_as_it_was() -> None:
+    for spread in (HARDLY, NOTHING):
+        one = candidate(INPUT, 19.0, 10.0)
+        (settled,) = refits(spread).settled([one], 0.05)
+        assert not settled.helps
+        assert settled.kind == one.kind
+        assert settled.attempt.decision == "nearly"
+        assert settled.attempt.gain == one.attempt.gain
+        assert "on blocks of the whole record" in settled.attempt.reason
+
+
+def test_what_costs_forecasts_is_not_settled() -> None:
+    scored = refits(WELL)
+    one = candidate(INPUT, 19.0, 10.0, worse=2.0)
+    assert one.harms
+    assert scored.settled([one], 0.05) == [one]
+    assert not scored.asked
+
+
+@pytest.mark.parametrize(("gain", "asked"), [(31.0, True), (29.0, False)])
+def test_what_gains_less_than_what_helps_need_not_be_settled(gain: float, asked: bool) -> None:
+    helps, other = candidate(DELAY, 30.0, 10.0), candidate(INPUT, gain, 20.0)
+    scored = refits(WELL)
+    found = scored.settled([helps, other], 0.05)
+    assert found[0] is helps
+    assert found[1].helps is asked
+    assert bool(scored.asked) is asked
+
+
+def test_what_is_on_blocks_of_the_whole_record_already_is_not_scored_again() -> None:
+    scored = refits(WELL)
+    assert not scored.settled([candidate(STEP, 19.0, 10.0)], 0.05)[0].helps
+    assert not scored.asked
+
+
+def test_a_round_that_the_time_limit_cuts_short_settles_nothing() -> None:
+    one, scored = candidate(INPUT, 19.0, 10.0), refits(WELL)
+    scored.late_then = True
+    assert scored.settled([one], 0.05) == [one]
+
+
+@pytest.mark.parametrize("settles", [False, True])
+def test_a_round_settles_before_it_decides(monkeypatch: pytest.MonkeyPatch, settles: bool) -> None:
+    nearly = candidate(INPUT, 19.0, 10.0)
+    after = [replace(nearly, helps=settles)]
+    monkeypatch.setattr(Refits, "judge", lambda self, some: [nearly] if some else [])
+    monkeypatch.setattr(Refits, "settled", lambda self, judged, level: after)
+    monkeypatch.setattr(Refits, "with_substeps", lambda self, one: one.tried)
+    current: Any = type("Current", (), {"model": MODEL})
+    given: Any = ([(nearly.found, (MODEL,))], current, range(480), np.arange(480) >= 240)
+    done = confirm(*given, number=1, seed=0, level=0.05, settings=SETTINGS, workers=1)
+    assert (done.winner is nearly.found) is settles
+
+
+@pytest.mark.parametrize(
+    ("q", "helps", "tried"),
+    [
+        (1e-8, True, ["extra input", "dead time"]),  # relatives beside it
+        (1e-8, False, ["extra input", "dead time", "input nonlinearity", "heavy tails"]),
+        (0.06, True, ["extra input", "dead time", "input nonlinearity", "heavy tails"]),  # by luck
+    ],
+)
+def test_beside_what_is_certain_and_helps_only_relatives_are_tried(
+    monkeypatch: pytest.MonkeyPatch, q: float, helps: bool, tried: list[str]
+) -> None:
+    one = replace(candidate(INPUT, 50.0, 1.0, q=q), helps=helps)
+    others = [candidate(effect, -5.0, 1.0, q=0.5)
+              for effect in (DELAY, effects.InputNonlinearity(), effects.HeavyTails())]  # fmt: skip
+    by_found = {id(each.found): each for each in (one, *others)}
+    asked: list[list[str]] = []
+
+    def judge(self: Any, some: Any) -> list[Judged]:
+        asked.append([found.effect.name for found, _ in some])
+        return [by_found[id(found)] for found, _ in some]
+
+    monkeypatch.setattr(Refits, "judge", judge)
+    monkeypatch.setattr(Refits, "with_substeps", lambda self, one: one.tried)
+    monkeypatch.setattr(Refits, "settled", lambda self, judged, level: judged)
+    monkeypatch.setattr(decision, "confirmed_together", lambda *given: None)
+    current: Any = type("Current", (), {"model": MODEL})
+    candidates = [(each.found, (MODEL,)) for each in (*others, one)]
+    given: Any = (candidates, current, range(480), np.arange(480) >= 240)
+    done = confirm(*given, number=1, seed=0, level=0.05, settings=SETTINGS, workers=1)
+    assert sorted(name for some in asked for name in some) == sorted(tried)
+    assert asked[0] == (["extra input"] if q < 0.05 else [])
+    names = [attempt.name for attempt in done.attempts if attempt.decision != "not tried"]
+    assert names == [each.found.effect.name for each in (*others, one)
+                     if each.found.effect.name in tried]  # fmt: skip
+    left = [attempt.name for attempt in done.attempts if attempt.decision == "not tried"]
+    assert left == [each.found.effect.name for each in others
+                    if each.found.effect.name not in tried]  # fmt: skip
