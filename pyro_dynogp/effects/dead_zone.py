@@ -20,6 +20,8 @@ from pyro_dynogp.statistics.shares_of_inputs import linear_responses, paths
 
 # Quantiles of an input between which a dead zone may lie.
 LEVELS = np.linspace(0.0, 1.0, 9)
+# How lower and upper limit move together where a zone is refined.
+MOVED = ((1, 0), (0, 1), (1, 1), (-1, 1))
 
 
 def dead_zone(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> Evidence:
@@ -95,13 +97,24 @@ class DeadZoneOfInput(Effect):
             for share in AROUND
         ]
 
+    def sentence(self, evidence: Evidence, model: Model) -> str:
+        """The limits as refits have them."""
+        zone = model.channels[-1]
+        assert isinstance(zone, DeadZone)
+        low, high = number_of(evidence, "low"), number_of(evidence, "high")
+        refitted = f"from {zone.low:.3g} to {zone.high:.3g},"
+        return evidence.sentence.replace(f"from {low:.3g} to {high:.3g},", refitted)
+
     def refine(self, model: Model, record: Record, times: int) -> Sequence[Model]:
-        """Each limit a little lower and higher."""
+        """Each limit a little lower and higher, the zone as a whole, and narrower and wider.
+
+        A limit that is too low makes up for another one that is.
+        """
         last = model.channels[-1]
         assert isinstance(last, DeadZone)
-        width = last.high - last.low
+        moves = [(share - 1.0) * (last.high - last.low) for share in FINER[times]]
         return [
-            changed(model, [last], **{limit: getattr(last, limit) + (share - 1.0) * width})
-            for share in FINER[times]
-            for limit in ("low", "high")
+            changed(model, [last], low=last.low + a * move, high=last.high + b * move)
+            for move in moves
+            for a, b in MOVED
         ]

@@ -83,6 +83,13 @@ class Hysteresis(Effect):
             return []
         return [with_channel(model, Play(channel, share * width)) for share in AROUND]
 
+    def sentence(self, evidence: Evidence, model: Model) -> str:
+        """The width as refits have it."""
+        behind = model.channels[-1]
+        assert isinstance(behind, Play)
+        width = number_of(evidence, "width")
+        return evidence.sentence.replace(f"play, {width:.3g}", f"play, {behind.width:.3g}")
+
     def refine(self, model: Model, record: Record, times: int) -> Sequence[Model]:
         """The play a little narrower and wider."""
         return finer(model, "width", times)

@@ -3,9 +3,14 @@
 import numpy as np
 import pytest
 
+import pyro_dynogp as dgp
+from pyro_dynogp import effects
 from pyro_dynogp.data import signals
+from pyro_dynogp.data.channels import DeadZone
 from pyro_dynogp.effects.dead_zone import dead_zone
 from pyro_dynogp.effects.input_nonlinearity import input_nonlinearity
+from pyro_dynogp.models.variants import with_channel
+from pyro_dynogp.statistics.evidence import Evidence
 from tests.discrepancy.made import SETTINGS, lag, residuals_of
 from tests.effects.scenes import two_paths
 
@@ -38,3 +43,21 @@ def test_an_input_that_saturates_has_no_dead_zone():
     r = residuals_of(a + lag(np.clip(u[:, 1], -0.7, 0.7), 0.8) + e, a + 0.7 * b, u)
     assert input_nonlinearity(r, SETTINGS).p_value < 1e-3
     assert dead_zone(r, SETTINGS).p_value > 0.05
+
+
+def test_a_zone_moves_as_a_whole_and_is_told_as_refits_have_it():
+    record = dgp.Record(np.arange(5.0), np.arange(5.0), np.ones(5), input_names=("u",))
+    zone = DeadZone("u", -1.0, 1.0)
+    model = with_channel(dgp.LinearDynamicGP(inputs=1, pairs=1), zone)
+    finer = effects.DeadZoneOfInput().refine(model, record, 0)
+    limits = {(round(one.channels[-1].low, 2), round(one.channels[-1].high, 2)) for one in finer}
+    assert limits == {
+        (-1.24, 1.0), (-1.0, 0.76), (-1.24, 0.76), (-0.76, 0.76),
+        (-0.74, 1.0), (-1.0, 1.26), (-0.74, 1.26), (-1.26, 1.26),
+    }  # fmt: skip
+    said = "Channel 'u' has no effect on 'y' from -0.5 to 0.7, about 1 V (rms)."
+    found = Evidence(
+        "dead zone", 1.0, 0.01, 1.0, 1.0, {"channel": "u", "low": -0.5, "high": 0.7}, said, None
+    )
+    sentence = effects.DeadZoneOfInput().sentence(found, model)
+    assert sentence == "Channel 'u' has no effect on 'y' from -1 to 1, about 1 V (rms)."

@@ -3,9 +3,14 @@
 import numpy as np
 import pytest
 
+import pyro_dynogp as dgp
+from pyro_dynogp import effects
 from pyro_dynogp.data import signals
+from pyro_dynogp.data.channels import Play
 from pyro_dynogp.effects.dead_time import dead_time
 from pyro_dynogp.effects.hysteresis import hysteresis
+from pyro_dynogp.models.variants import with_channel
+from pyro_dynogp.statistics.evidence import Evidence
 from tests.discrepancy.made import SETTINGS, lag, residuals_of
 from tests.effects.scenes import two_paths
 
@@ -37,3 +42,12 @@ def test_a_phase_lag_is_not_play():
     )
     assert dead_time(late, SETTINGS).p_value < 1e-6
     assert hysteresis(late, SETTINGS).p_value > 0.01
+
+
+def test_play_is_told_as_refits_have_it():
+    model = with_channel(dgp.LinearDynamicGP(inputs=1, pairs=1), Play("u", 0.6))
+    said = "'y' follows channel 'u' with play, 0.5 wide, about 1 V (rms)."
+    where = {"channel": "u", "width": 0.5}
+    found = Evidence("hysteresis", 1.0, 0.01, 1.0, 1.0, where, said, None)
+    told = effects.Hysteresis().sentence(found, model)
+    assert told == "'y' follows channel 'u' with play, 0.6 wide, about 1 V (rms)."
