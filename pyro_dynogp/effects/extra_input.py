@@ -111,3 +111,15 @@ class ExtraInput(Effect):
             made = Product(channel, other, centre_of(record, channel), centre_of(record, other))
         alone = with_channel(model, made)
         return [alone, with_channel(alone, Recorded(channel))]
+
+    def sentence(self, evidence: Evidence, model: Model) -> str:
+        """With the delay that refits have, if any: dynamics may stand for it."""
+        channel, delay = str(evidence.where["channel"]), number_of(evidence, "delay")
+        if not delay:
+            return evidence.sentence
+        start, _, rest = evidence.sentence.partition(f", {delay:.3g}")
+        symbol, _, end = rest.partition(" later")
+        for late in model.channels:
+            if isinstance(late, Delayed) and late.channel == channel and late.delay is not None:
+                return f"{start}, {late.delay:.3g}{symbol} later{end}"
+        return start + end

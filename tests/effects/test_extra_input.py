@@ -1,11 +1,17 @@
 """A channel that acts: found with its form and delay, and not taken for what inputs do."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+import pyro_dynogp as dgp
+from pyro_dynogp import effects
 from pyro_dynogp.data import signals
+from pyro_dynogp.data.channels import Delayed, Recorded
 from pyro_dynogp.effects.dynamics import unmodelled_dynamics
 from pyro_dynogp.effects.extra_input import extra_input
+from pyro_dynogp.statistics.evidence import Evidence
 from tests.discrepancy.made import SETTINGS, coloured, lag, residuals_of
 from tests.effects.scenes import first_extra, step_inputs
 
@@ -63,3 +69,21 @@ def test_a_candidate_with_gaps_and_no_candidates():
     w[rng.random(N) < 0.05] = np.nan
     assert first_extra(residuals_of(y, parts.sum(1), u, {"w": w}), SETTINGS).p_value < 1e-4
     assert extra_input(residuals_of(y, parts.sum(1), u), SETTINGS) == []
+
+
+@pytest.mark.parametrize(
+    ("channels", "late"),
+    [
+        ((Recorded("w"),), ""),
+        ((Recorded("w"), Delayed("w", 0.25)), ", 0.25 s later"),
+        ((Delayed("u", 0.5), Recorded("w")), ""),
+    ],
+)  # fmt: skip
+def test_its_delay_is_told_as_refits_have_it(channels, late):
+    model = dgp.LinearDynamicGP(inputs=2, pairs=1, channels=channels)
+    said, told = (f"Channel 'w' acts on 'y'{x}, about 2 V (rms)." for x in (", 0.3 s later", late))
+    where = {"channel": "w", "form": "linear", "delay": 0.3}
+    found = Evidence("extra input", 1.0, 0.01, 1.0, 1.0, where, said, None)
+    assert effects.ExtraInput().sentence(found, model) == told
+    at_once = replace(found, where={**where, "delay": 0.0}, sentence="Channel 'w' acts on 'y'.")
+    assert effects.ExtraInput().sentence(at_once, model) == at_once.sentence
