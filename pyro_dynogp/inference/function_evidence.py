@@ -65,6 +65,9 @@ def kernels_by_evidence(
     """Of the leading optima, with kernels by the evidence, the one that has the most of it.
 
     Joint densities under different kernels do not compare.
+
+    Raises:
+        ValueError: where next to none of them predictions are finite.
     """
     if not kernel_sites(model):  # functions that are known
         return list(optima)
@@ -74,6 +77,11 @@ def kernels_by_evidence(
         found, energy = with_kernels_by_evidence(model, records, one, run, key, enough=least)
         if energy < least:
             best, least = found, energy
+    if not np.isfinite(least):
+        raise ValueError(
+            "fit: next to the best optimum predictions run away, so that kernels of functions "
+            "cannot be learnt. Take another seed, fewer pairs, or a longer record."
+        )
     return [best]
 
 
@@ -95,11 +103,13 @@ def with_kernels_by_evidence(
 
     Returns:
         The optimum, or the given one where no round raises the evidence; and its -log density
-        without the functions' values [nats].
+        without the functions' values [nats], infinite where predictions next to it are not finite.
     """
     names = kernel_sites(model)
     optimizer = optimizer_near(model)
     here = _Expansion.at(model, records, optimum.values)
+    if not np.isfinite(here.energy):
+        return optimum, np.inf
     for number in range(rounds):
         values, gain = here.best()
         if gain < SETTLED or (number and here.energy > enough + BEHIND):
@@ -152,8 +162,9 @@ class _Expansion:
             energy, slopes = potential.value_and_gradient(z)
             slope = slopes[places]
             curvature = potential.hessian_of(z, places.tolist()) - np.eye(len(places))
-            eigenvalues, axes = np.linalg.eigh(curvature)
+            eigenvalues, axes = np.linalg.eigh(np.nan_to_num(curvature))
             fisher = (axes * eigenvalues.clip(0.0)) @ axes.T
+            fisher[~np.isfinite(curvature)] = np.nan
         gradient = z[places] - slope  # the prior of whitened values is standard normal
         return cls(
             model,
@@ -168,7 +179,10 @@ class _Expansion:
 
     @property
     def energy(self) -> float:
-        """-log density of the kernels and of all else but the functions' values [nats]."""
+        """-log density of the kernels and of all else but the functions' values [nats].
+
+        Not finite next to runs that grow without bound.
+        """
         inner = torch.eye(len(self.places), dtype=torch.float64) + self.fisher
         return self.joint + 0.5 * float(torch.linalg.slogdet(inner).logabsdet)
 

@@ -310,3 +310,26 @@ def test_a_refit_keeps_to_the_evidence(rounds):
     grown = refit(line, line.records[0], model=model)
     name = kernel_sites(grown.model)[0]
     assert float(grown.mode[name]) > 1.0
+
+
+def test_next_to_a_run_that_grows_without_bound_there_is_no_evidence(rounds, monkeypatch):
+    problem, _, found = rounds
+    steep = {**found.values, "f_values": 30.0 * found.values["f_values"]}
+    wild, at = replace(found, values=steep), _Expansion.at
+
+    def beyond(model, records, values):
+        here = at(model, records, values)
+        return replace(here, fisher=torch.nan * here.fisher) if values is steep else here
+
+    monkeypatch.setattr(_Expansion, "at", beyond)
+    kept, energy = with_kernels_by_evidence(problem.target, problem.records, wild, ALONE, "wild")
+    assert kept is wild
+    assert energy == math.inf
+    with pytest.raises(ValueError, match="predictions run away, so that kernels of functions"):
+        kernels_by_evidence(problem.target, problem.records, [wild, wild], ALONE)
+    both = kernels_by_evidence(problem.target, problem.records, [wild, found], ALONE)
+    assert both[0].values["f_lengthscale"] == found.values["f_lengthscale"]
+    # Nor is it where a round leads to.
+    monkeypatch.setattr(_Expansion, "best", lambda self: (steep, 1.0))
+    monkeypatch.setattr(function_evidence, "maximise", lambda *args, **options: [wild])
+    assert with_kernels_by_evidence(problem.target, problem.records, found, ALONE, "to")[0] is found
