@@ -34,7 +34,8 @@ def confirmed_together(refits: Refits, judged: Sequence[Judged], level: float) -
     """The first of two effects that help together, and neither alone; None where there are none.
 
     Each may mask the other: errors of what is still missing hide what is gained. Both have to be
-    certain in the residual, the pair has to gain, and more than either alone. It is the one of
+    beyond doubt in the residual (their false discovery rates no more than `unsure`), the pair has
+    to gain, and more than either alone. It is the one of
     larger gain that is returned, to be added first; the other one has the next round.
 
     Args:
@@ -76,7 +77,8 @@ def confirmed_together(refits: Refits, judged: Sequence[Judged], level: float) -
 
 
 def _pairs(refits: Refits, judged: Sequence[Judged], level: float) -> list[Pair]:
-    """Pairs of the most gainful effects of structure that the residual is certain of."""
+    """Pairs of the most gainful effects of structure that the residual has no doubt of."""
+    level = min(level, refits.settings.unsure)
     sure = [
         one for one in judged
         if one.found.q_value <= level and one.kind[1] == "forecast" and not one.tried.failure

@@ -140,9 +140,11 @@ class Refits:
     def settled(self, judged: Sequence[Judged], level: float) -> list[Judged]:
         """What may be worth most on the last block, scored on blocks of the whole record as well.
 
-        Where the residual is certain of an effect, and its gain is more than that of all that
-        help, if short of its error, most of the record is held out instead, a part at a time.
+        Where the residual speaks for an effect without a doubt (its false discovery rate is no more
+        than `unsure`), and its gain is more than that of all that help, if short of its error, most
+        of the record is held out instead, a part at a time.
         """
+        level = min(level, self.settings.unsure)
         most = max((one.attempt.gain for one in judged if one.helps), default=0.0)
         unsettled = [
             one for one in judged

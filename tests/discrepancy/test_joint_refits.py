@@ -103,7 +103,7 @@ def test_a_pair_has_to_gain_and_more_than_either_alone(both, step, extra, first)
 
 
 @pytest.mark.usefixtures("extensions")
-@pytest.mark.parametrize(("q", "sure"), [(0.049, True), (0.051, False)])
+@pytest.mark.parametrize(("q", "sure"), [(0.0099, True), (0.0101, False)])
 def test_both_are_certain_in_the_residual(q: float, sure: bool) -> None:
     alone = {"level shift": tried(20.0, 15.0), "extra input": tried(10.0, 9.0)}
     refits = Trials(tried(60.0), alone)

@@ -65,8 +65,8 @@ def candidate(
         (1.0, 10.0, 1e-4, True),
         (-1.0, 10.0, 1e-4, False),
         (30.0, 10.0, 1e-4, False),  # helps as it is
-        (19.0, 10.0, 0.049, True),
-        (19.0, 10.0, 0.051, False),  # the residual is not certain of it
+        (19.0, 10.0, 0.0099, True),
+        (19.0, 10.0, 0.0101, False),  # the residual has its doubts
     ],
 )
 def test_what_the_last_block_leaves_open_is_scored_on_the_whole_record(
@@ -175,3 +175,9 @@ def test_beside_what_is_certain_and_helps_only_relatives_are_tried(
     left = [attempt.name for attempt in done.attempts if attempt.decision == "not tried"]
     assert left == [each.found.effect.name for each in others
                     if each.found.effect.name not in tried]  # fmt: skip
+
+
+def test_a_lower_level_asks_for_more() -> None:
+    one, scored = candidate(INPUT, 19.0, 10.0, q=0.009), refits(WELL)
+    assert scored.settled([one], 0.008) == [one]
+    assert scored.settled([one], 0.0095)[0].helps
