@@ -112,7 +112,7 @@ def with_kernels_by_evidence(
         return optimum, np.inf
     for number in range(rounds):
         values, gain = here.best()
-        if gain < SETTLED or (number and here.energy > enough + BEHIND):
+        if not gain >= SETTLED or (number and here.energy > enough + BEHIND):
             break
         found = maximise(
             model, records, [values], run, optimizer=optimizer, steps=STEPS,
@@ -202,6 +202,8 @@ class _Expansion:
         v0 = whole[torch.tensor(self.places)]
         identity = torch.eye(len(v0), dtype=torch.float64)
         pull = self.gradient + self.fisher @ v0
+        eigenvalues, axes = torch.linalg.eigh(self.fisher)
+        half = (axes * eigenvalues.clamp_min(0.0).sqrt()).mT  # F = half' half
         prior = {s.name: s.prior for s in self.model.sites(self.scaling) if s.name in names}
 
         def level(theta: Tensor) -> tuple[Tensor, Tensor]:
@@ -211,11 +213,12 @@ class _Expansion:
             A = torch.block_diag(
                 *(torch.linalg.solve_triangular(a, b, upper=False) for a, b in roots)
             )
-            root = torch.linalg.cholesky(identity + A.mT @ self.fisher @ A)
+            # The Cholesky factor of P by orthogonal steps: steep likelihoods spoil P itself.
+            root = torch.linalg.qr(torch.cat([half @ A, identity]))[1].mT
             m = torch.cholesky_solve((A.mT @ pull)[:, None], root)[:, 0]
             off = A @ m - v0
             found = self.gradient @ off - 0.5 * (off @ self.fisher @ off + m @ m)
-            found = found - root.diagonal().log().sum()
+            found = found - root.diagonal().abs().log().sum()
             return found + sum(prior[n].log_prob(values[n]).sum() for n in names), m
 
         def objective(theta: np.ndarray) -> tuple[float, np.ndarray]:

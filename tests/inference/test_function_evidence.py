@@ -333,3 +333,14 @@ def test_next_to_a_run_that_grows_without_bound_there_is_no_evidence(rounds, mon
     monkeypatch.setattr(_Expansion, "best", lambda self: (steep, 1.0))
     monkeypatch.setattr(function_evidence, "maximise", lambda *args, **options: [wild])
     assert with_kernels_by_evidence(problem.target, problem.records, found, ALONE, "to")[0] is found
+
+
+def test_steep_likelihoods_have_an_evidence_too():
+    """P is not positive definite in double precision where the Fisher matrix is that large."""
+    here = expansion("one function")
+    one = torch.tensor(np.random.default_rng(0).standard_normal(len(here.places)))
+    steep = replace(here, fisher=1e20 * torch.outer(one, one))
+    values, gain = steep.best()
+    assert np.isfinite(gain)
+    assert gain >= 0.0
+    assert all(bool(torch.isfinite(value).all()) for value in values.values())
