@@ -21,8 +21,9 @@ class LoopSettings:
             Evidence: coverage of the error under autocorrelation is measured in the tests of
             `criticism.comparison`; 1 and 3 judge 9 and 6 of 114 stored refits otherwise.
         unsure, unsure_errors: p-value of the test beyond which such a gain must exceed so many
-            block standard errors. Evidence: of 734 effects named in 924 planted records 7 right and
-            13 wrong ones had larger p-values (docs/planted).
+            block standard errors; and false discovery rate up to which a gain is settled on the
+            whole record, or a pair refitted. Evidence: of 734 effects named in 924 planted records
+            7 right and 13 wrong ones had larger p-values (docs/planted).
         nearly: block standard errors from which a gain that is not enough is called nearly so.
             Evidence: convention: of gains of nothing 4 % lie between 1.5 and 2 errors.
         cap: most that one sample counts for where the plain sum is not certain [nats].
