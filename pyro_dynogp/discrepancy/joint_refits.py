@@ -35,8 +35,8 @@ def confirmed_together(refits: Refits, judged: Sequence[Judged], level: float) -
 
     Each may mask the other: errors of what is still missing hide what is gained. Both have to be
     beyond doubt in the residual (their false discovery rates no more than `unsure`), the pair has
-    to gain, and more than either alone. It is the one of
-    larger gain that is returned, to be added first; the other one has the next round.
+    to gain, and more than either alone. It is the one of larger gain that is returned, to be added
+    first; the other one has the next round.
 
     Args:
         refits: of the round. judged: candidates, of which none that is certain helps. level: of the

@@ -88,8 +88,7 @@ class Refits:
         tasks = {("", kind): self.trial((self.model,), kind, None) for kind in kinds}
         for (found, variants), kind in zip(candidates, kinds, strict=True):
             tasks[repr(variants), kind] = self.trial(variants, kind, found)
-        new = {key: trial for key, trial in tasks.items() if key not in self.results}
-        self.results.update(self.run(new, "refits"))
+        self._run_new(tasks, "refits")
         return [
             self.judged(found, kind, self.results[repr(variants), kind])
             for (found, variants), kind in zip(candidates, kinds, strict=True)
@@ -125,17 +124,20 @@ class Refits:
 
         Against the model without it, which is scored there, too.
         """
-        more = {
-            repr(one.tried.model): self.trial((one.tried.model,), SPREAD, one.found)
+        trials = {
+            (repr(one.tried.model), SPREAD): self.trial((one.tried.model,), SPREAD, one.found)
             for one in several
             if one.kind != SPREAD
         }
-        if more and ("", SPREAD) not in self.results:
-            more[""] = self.trial((self.model,), SPREAD, None)
-        found = self.run(more, "refits once more")
-        if "" in found:
-            self.results["", SPREAD] = found.pop("")
-        return found
+        if trials:
+            base = {("", SPREAD): self.trial((self.model,), SPREAD, None)}
+            self._run_new(trials | base, "refits once more")
+        return {key[0]: self.results[key] for key in trials if key in self.results}
+
+    def _run_new(self, tasks: dict[tuple[str, Kind], Trial], label: str) -> None:
+        """Keep the results of trials that there are none of yet."""
+        new = {key: trial for key, trial in tasks.items() if key not in self.results}
+        self.results.update(self.run(new, label))
 
     def settled(self, judged: Sequence[Judged], level: float) -> list[Judged]:
         """What may be worth most on the last block, scored on blocks of the whole record as well.

@@ -40,6 +40,7 @@ class Trials:
     early: bool = False
     asked: list[tuple[str, ...]] = field(default_factory=list)
     number: int = 1
+    model: Any = MODEL
     settings: Any = SETTINGS
     record: Any = None
 
@@ -49,8 +50,8 @@ class Trials:
                  ("forecast", "one step")]  # fmt: skip
         self.results = {("", kind): nothing for kind in kinds}
 
-    def trial(self, models: Any, kind: Any, found: Found) -> Any:
-        return (models, kind, found.effect.name)
+    def trial(self, models: Any, kind: Any, found: Found | None) -> Any:
+        return (models, kind, "" if found is None else found.effect.name)
 
     def run(self, tasks: dict[Any, Any], label: str) -> dict[Any, Tried]:
         self.asked += [models if models[0] != MODEL else (name,) for models, _, name in
@@ -60,7 +61,7 @@ class Trials:
             for key, (models, _, name) in tasks.items()
         }
 
-    on_spread_blocks = Refits.on_spread_blocks
+    on_spread_blocks, _run_new = Refits.on_spread_blocks, Refits._run_new
 
     def candidate(self, effect: effects.Effect, q: float) -> Judged:
         found = Found(effect, Evidence(effect.name, 5.0, q / 10.0, 1.0, 0.1), q)

@@ -33,9 +33,9 @@ class Scored(Refits):
     late_then: bool = False
 
     def run(self, tasks: dict[Any, Any], label: str) -> dict[Any, Tried]:
-        self.asked += [key for key in tasks if key]
+        self.asked += [name for name, _ in tasks if name]
         self.early = self.late_then
-        return {key: self.spread if key else tried(0.0, 1e-9) for key in tasks}
+        return {key: self.spread if key[0] else tried(0.0, 1e-9) for key in tasks}
 
 
 def refits(spread: Tried) -> Scored:
@@ -175,6 +175,13 @@ def test_beside_what_is_certain_and_helps_only_relatives_are_tried(
     left = [attempt.name for attempt in done.attempts if attempt.decision == "not tried"]
     assert left == [each.found.effect.name for each in others
                     if each.found.effect.name not in tried]  # fmt: skip
+
+
+def test_what_was_scored_on_the_whole_record_is_not_refitted_again() -> None:
+    one, scored = candidate(INPUT, 19.0, 10.0), refits(HARDLY)
+    scored.settled([one], 0.05)
+    assert scored.on_spread_blocks([one]) == {repr(MODEL): HARDLY}
+    assert len(scored.asked) == 1
 
 
 def test_a_lower_level_asks_for_more() -> None:

@@ -24,6 +24,8 @@ def test_dead_zone_of_one_channel(low, high):
     assert found.where["channel"] == "v"
     assert found.where["low"] == pytest.approx(low, abs=0.2)
     assert found.where["high"] == pytest.approx(high, abs=0.2)
+    refitted = with_channel(dgp.LinearDynamicGP(inputs=2, pairs=1), DeadZone("v", -8.0, 9.0))
+    assert "from -8 to 9, about" in effects.DeadZoneOfInput().sentence(found, refitted)
 
 
 def test_an_input_of_two_values_has_no_dead_zone_but_others_may():

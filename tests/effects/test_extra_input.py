@@ -50,6 +50,9 @@ def test_the_delay_of_a_missing_channel():
     found = first_extra(residuals_of(y, parts.sum(1), u, {"w": w}), SETTINGS)
     assert found.p_value < 1e-4
     assert found.where["delay"] == pytest.approx(1.25, abs=0.1)
+    late = (Recorded("w"), Delayed("w", 9.0))
+    refitted = dgp.LinearDynamicGP(inputs=3, pairs=1, channels=late)
+    assert ", 9 s later, about" in effects.ExtraInput().sentence(found, refitted)
 
 
 def test_what_used_inputs_explain_is_not_ascribed_to_a_candidate():

@@ -25,6 +25,8 @@ def test_play_at_an_input():
     assert found.p_value < 1e-3
     assert found.where["channel"] == "v"
     assert found.where["width"] == pytest.approx(0.8, rel=0.2)
+    refitted = with_channel(dgp.LinearDynamicGP(inputs=2, pairs=1), Play("v", 9.0))
+    assert "with play, 9 wide, about" in effects.Hysteresis().sentence(found, refitted)
 
 
 def test_play_at_the_output():
