@@ -27,7 +27,7 @@ LINES = 31_500
 # lanes (500 lines), controllers (120 lines), refits of two effects together (140 lines) and gains
 # that are settled on the whole record (50 lines), numbers told as refits have them (30 lines) and
 # steep likelihoods (20 lines) came since. To shrink, and to go.
-LINES_TODAY = 51_985
+LINES_TODAY = 52_070
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

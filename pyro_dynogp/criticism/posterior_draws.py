@@ -14,10 +14,10 @@ from pyro_dynogp.criticism.finding import apart
 from pyro_dynogp.inference.cascade_coordinates import StraightPotential
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.importance_sampling import sample_around, samples_of, systematic
+from pyro_dynogp.inference.laplace import fisher_normal
+from pyro_dynogp.inference.laplace import laplace as laplace_of
 from pyro_dynogp.inference.log_joint import log_joint_of
 from pyro_dynogp.inference.methods.annealed import Joint, anneal
-from pyro_dynogp.inference.optimise.descent import bounded_root
-from pyro_dynogp.inference.optimise.gauss_newton import Innovations, has_innovations
 from pyro_dynogp.inference.pareto import good_k, psis
 from pyro_dynogp.inference.posterior_draws import PosteriorDraws
 from pyro_dynogp.inference.posteriors import Draws, Mixture, Sampled
@@ -117,7 +117,7 @@ def laplace(fit: Fitted, values: Values) -> Mixture:
     """Normal around an optimum, from the Hessian of the log joint density there."""
     with seeded(fit.seed):
         potential = Potential(fit.model.collapsed, (_data(fit),), values)
-        centre, root = potential.laplace(values)
+        centre, root = laplace_of(potential, values)
     return Mixture.normal(potential, torch.as_tensor(centre), torch.as_tensor(root))
 
 
@@ -138,16 +138,11 @@ def normal_near(fit: Fitted, share: float = 1.0) -> Mixture:
     Args:
         fit: a posterior mode. share: of the posterior's standard deviations.
     """
-    model = fit.model.collapsed
     with seeded(fit.seed):
-        potential = Potential(model, (_data(fit),), fit.mode)
-        z = potential.pack(fit.mode)
-        here = Innovations(potential).local(z.numpy()) if has_innovations(model) else None
-    if here is None:
-        root = laplace(fit, fit.mode).scale_tril[0]
-    else:
-        root = torch.as_tensor(bounded_root(here.fisher + here.prior))
-    return Mixture.normal(potential, z, share * root)
+        potential = Potential(fit.model.collapsed, (_data(fit),), fit.mode)
+        near = fisher_normal(potential, fit.mode, steps=0)
+    root = laplace(fit, fit.mode).scale_tril[0] if near is None else torch.as_tensor(near[1])
+    return Mixture.normal(potential, potential.pack(fit.mode), share * root)
 
 
 def carried(

@@ -16,7 +16,7 @@ from torch.distributions.transforms import Transform
 
 from pyro_dynogp.inference.linear_density import LinearEnergy, linear_density
 from pyro_dynogp.inference.log_joint import Direct, LogJoint, density_of
-from pyro_dynogp.inference.optimise.descent import WIDEST, bounded_root, descend, hessian, polished
+from pyro_dynogp.inference.optimise.descent import hessian
 from pyro_dynogp.inference.priors_of_vectors import Constrained, vector_priors
 from pyro_dynogp.layers.sites import Arguments, Program
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
@@ -28,8 +28,6 @@ WALL = 1e15
 AT_ONCE = 12_000
 # So many times as many of a linear model, whose points need next to no memory.
 LINEAR = 8
-# Most iterations to the mode of the unconstrained vector's density.
-LAPLACE_STEPS = 120
 
 
 @dataclass(frozen=True)
@@ -256,6 +254,14 @@ class Potential:
         """Energies (k,) at values of the sites."""
         return self.values_and_gradients(np.stack([self.pack(one).numpy() for one in points]))[0]
 
+    def energies(self, z: Tensor) -> Tensor:
+        """Energies (k,) of the unconstrained vector's density at z (k, d), infinite where none."""
+        if not getattr(self.model, "takes_batches", False):
+            found = [energies_of(lambda x: self.energy(x[0], jacobian=True)[None], one[None]) for
+                     one in z]  # fmt: skip
+            return torch.cat(found)
+        return energies_of(lambda x: self.energy(x, jacobian=True), z)
+
     def hessian(self, z: np.ndarray, *, step: float = 1e-4) -> np.ndarray:
         """Hessian (d, d) of the energy with Jacobian, by central differences of the gradient."""
         return self.hessian_of(z, range(z.shape[0]), step=step)
@@ -267,34 +273,6 @@ class Potential:
     def with_jacobian(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Energies (k,) and gradients (k, d) of the unconstrained vector's density."""
         return self.values_and_gradients(z, jacobian=True)
-
-    def log_evidence(self, values: Mapping[str, Tensor]) -> float:
-        """Laplace's approximation of log p(y) from the neighbourhood of `values` alone [nats].
-
-        A Gaussian integral of the unconstrained vector's density with the curvature there: by it
-        optima of one model are compared, of which a high one may be a needle. Directions that are
-        flatter than a standard deviation of `WIDEST` count as that wide (Tierney & Kadane 1986).
-        """
-        z = self.pack(values).numpy()
-        energy = self.value_and_gradient(z, jacobian=True)[0]
-        curvature = np.maximum(np.linalg.eigvalsh(self.hessian(z, step=1e-3)), WIDEST**-2)
-        return float(-energy - 0.5 * np.log(curvature / (2.0 * math.pi)).sum())
-
-    def laplace(
-        self, values: Mapping[str, Tensor], steps: int = LAPLACE_STEPS
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Centre (d,) and root (d, d) of the Laplace approximation of the unconstrained vector.
-
-        The centre is the mode of that vector's own density (with Jacobian), climbed to from
-        `values` in so many iterations at most: the mode of the constrained density can lie on a
-        boundary, at minus infinity.
-        """
-        every = self.hessian_cost
-        z, _, _ = descend(
-            self.with_jacobian, self.pack(values).numpy(), steps, every=every, first=0
-        )
-        z, _, _ = polished(self.with_jacobian, z)
-        return z, bounded_root(self.hessian(z))
 
 
 # Unconstrained value of what lies on a boundary: within 1e-13 of it.

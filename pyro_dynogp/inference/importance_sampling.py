@@ -23,6 +23,7 @@ from torch import Tensor
 from pyro_dynogp.inference.adaptive_importance import Adapted, adapt
 from pyro_dynogp.inference.cascade_coordinates import StraightPotential
 from pyro_dynogp.inference.density import WALL, Potential, heaviest
+from pyro_dynogp.inference.laplace import laplace, log_evidence
 from pyro_dynogp.inference.log_joint import Direct
 from pyro_dynogp.inference.methods.annealed import (
     Annealed,
@@ -264,7 +265,9 @@ def weighed(potential: Potential, optima: Sequence[Values]) -> tuple[list[Values
     probabilities are for the importance ratios to say.
     """
     different = distinct(potential, optima)
-    evidence = torch.tensor([potential.log_evidence(one) for one in different], dtype=torch.float64)
+    evidence = torch.tensor(
+        [log_evidence(potential, one) for one in different], dtype=torch.float64
+    )
     order, weights = heaviest(evidence, different[0], least=LEAST_WEIGHT, most=MOST_OPTIMA)
     return [different[index] for index in order], weights
 
@@ -278,11 +281,11 @@ def proposal_of(
 
     Pairs of all optima are in the order that those of the first have.
     """
-    found = [potential.laplace(optima[0], steps)]
+    found = [laplace(potential, optima[0], steps)]
     order = PairOrder.around(potential, found[0][0])
     for values in optima[1:]:
         ordered = values if order is None else order.put(potential, values)
-        found.append(potential.laplace(ordered, steps))
+        found.append(laplace(potential, ordered, steps))
     return StudentMixture(
         weights,
         torch.stack([torch.as_tensor(centre) for centre, _ in found]),

@@ -162,11 +162,14 @@ class LinearDensity:
         return np.where(bad, np.inf, -total), np.where(bad[:, None], 0.0, -slope)
 
     @np.errstate(all="ignore")
-    def prior_energies(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """-log prior (k,) of the values at u (k, d), and its gradients by u (k, d)."""
+    def prior_energies(self, u: np.ndarray, *, jacobian: bool) -> tuple[np.ndarray, np.ndarray]:
+        """-log prior (k,) at u (k, d), with `jacobian` of the vector; its gradients (k, d)."""
         values = self._priors.values(u)
         total, by_x = self._priors.log_prob(values.x)
-        return -total, -by_x * values.slope
+        slope = by_x * values.slope
+        if jacobian:
+            total, slope = total + values.log_jacobian, slope + values.log_jacobian_slope
+        return -total, -slope
 
     @np.errstate(all="ignore")
     def innovations(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

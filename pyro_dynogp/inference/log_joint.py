@@ -132,7 +132,7 @@ class Direct:
         records: prepared for the model. sites: in the order in which the model samples them, but
             those that are fixed.
         fixed: values (*shape) of sites that do not vary; their priors count.
-        observations: y of each record [output].
+        observations: y of each record [output]. constant: log prior density of fixed sites.
     """
 
     def __init__(self, model: Model, records: Records, fixed: Values | None = None) -> None:
@@ -143,7 +143,8 @@ class Direct:
         self.sites = [site for site in sites if site.name not in self.fixed]
         self.prior = Priors(self.sites)
         held = [site for site in sites if site.name in self.fixed]
-        self._constant = Priors(held).log_prob(self.fixed) if held else torch.zeros(())
+        nothing = torch.zeros((), dtype=torch.float64)
+        self.constant = Priors(held).log_prob(self.fixed).to(nothing) if held else nothing
         self.observations = [record.observations for record in self.records]
         self._at_limits = [at_limits(model.layers, each.record) for each in self.records]
 
@@ -154,8 +155,13 @@ class Direct:
         return found, sum(y.numel() for y in self.observations)
 
     def outputs(self, values: Values) -> list[OutputProcess]:
-        """Distribution of the outputs of each record at values (*b, *shape) of every site."""
+        """Distribution of the outputs of each record at values (*b, *shape) of `sites`."""
         model, found = self.model, []
+        if self.fixed:
+            site = self.sites[0]
+            lead = values[site.name].shape[: values[site.name].dim() - len(site.shape)]
+            held = {name: x.expand(lead + x.shape) for name, x in self.fixed.items()}
+            values = {**values, **held}
         system = model.system(values, self.records[0].scaling)
         for index, record in enumerate(self.records):
             suffix = "" if len(self.records) == 1 else f"_{index}"
@@ -169,12 +175,8 @@ class Direct:
 
     def likelihood(self, values: Values) -> Tensor:
         """Log-density () or (k,) of outputs and fixed sites at values (*shape) or (k, *shape)."""
-        total, some = self._constant.to(torch.float64), dict(values)
-        if self.fixed:
-            site = self.sites[0]
-            lead = values[site.name].shape[: values[site.name].dim() - len(site.shape)]
-            some |= {name: x.expand(lead + x.shape) for name, x in self.fixed.items()}
-        each = zip(self.outputs(some), self.observations, self._at_limits, strict=True)
+        total = self.constant
+        each = zip(self.outputs(values), self.observations, self._at_limits, strict=True)
         for outputs, y, at in each:
             total = total + outputs.log_prob(y)
             if at.any():

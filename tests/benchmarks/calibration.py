@@ -23,6 +23,7 @@ from scipy import stats
 
 import pyro_dynogp as dgp
 from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.laplace import laplace
 from pyro_dynogp.inference.optimise.maximum import maximise
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.poles import starting_values
@@ -85,7 +86,7 @@ def one_replicate(task: _Task) -> dict[str, int]:
         start = starting_values(model, records, count=1, seed=task.seed)
         optimum = maximise(model, records, start, Run(task.seed, workers=1), steps=60)[0]
         potential = Potential(model, (records,), truth)
-        centre, root = potential.laplace(optimum.values)
+        centre, root = laplace(potential, optimum.values)
         middle, scale = torch.as_tensor(centre), torch.as_tensor(root)
 
         def energy(parameters: dict[str, torch.Tensor]) -> torch.Tensor:

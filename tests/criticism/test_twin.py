@@ -11,6 +11,7 @@ import pyro_dynogp as dgp
 from pyro_dynogp.criticism import twin
 from pyro_dynogp.criticism.twin import Effort, Gap, _judged, _rms, _sites, twin_findings
 from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.laplace import laplace
 from pyro_dynogp.inference.log_joint import log_joint_of
 from pyro_dynogp.inference.methods.nuts import Chains
 from pyro_dynogp.inference.pareto import psis
@@ -26,7 +27,7 @@ def exact(model, argument, values, *, chains, draws, **options):
     """The posterior in place of NUTS's chains: Laplace's draws, resampled by their ratios."""
     del options
     potential = Potential(model, (argument,), values)
-    centre, root = potential.laplace(values)
+    centre, root = laplace(potential, values)
     guide = Mixture.normal(potential, torch.as_tensor(centre), torch.as_tensor(root))
     generator = torch.Generator().manual_seed(0)
     z = torch.randn(4000, len(centre), generator=generator, dtype=torch.float64)

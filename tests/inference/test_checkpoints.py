@@ -18,7 +18,7 @@ from pyro_dynogp.inference.methods import svi
 from pyro_dynogp.support import checkpoints
 from pyro_dynogp.support.checkpoints import Checkpoints, tensor_text, text_tensor
 from tests.inference.cascades import FAST, same, wiener
-from tests.inference.conftest import COLLAPSED, LAYERED
+from tests.inference.conftest import LAYERED, TRAINED
 
 
 class Counter:
@@ -137,7 +137,7 @@ def stamps(folder):
     ("options", "name", "chunk", "piece", "rest"),
     [
         # Small pieces, since the starts and their optima take as many steps.
-        ("COLLAPSED", "collapsed_fit", 4, "posterior-0-svi-{:07d}", range(8, 25, 4)),
+        ("TRAINED", "trained_fit", 4, "posterior-svi-{:07d}", range(8, 25, 4)),
         ("LAYERED", "layered_fit", 50, "start-0-{:07d}", (75,)),
     ],
 )
@@ -151,7 +151,7 @@ def test_a_killed_fit_goes_on_to_the_same_bits(
     before = stamps(tmp_path)
     assert awaited in before
     monkeypatch.setattr(svi, "CHUNK", chunk)
-    settings = COLLAPSED if options == "COLLAPSED" else LAYERED
+    settings = TRAINED if options == "TRAINED" else LAYERED
     resumed = dgp.fit(wiener(), bent, checkpoint=tmp_path, **settings)
     assert same(resumed, whole)
     after = stamps(tmp_path)

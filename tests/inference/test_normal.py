@@ -10,9 +10,11 @@ import torch
 from scipy.stats import multivariate_normal
 
 from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.laplace import laplace
 from pyro_dynogp.inference.methods.normal import (
     AS_GOOD,
     CLOSE,
+    NO_BETTER,
     best_width,
     log_weights,
     variational,
@@ -47,7 +49,7 @@ def test_where_the_posterior_is_normal_nothing_is_trained():
     found = variational(
         normal, (Y,), {"w": torch.zeros(2, dtype=torch.float64)}, Run(), Schedule(50)
     )
-    assert found.message == AS_GOOD
+    assert found.message == AS_GOOD.format(CLOSE)
     assert found.elbo == pytest.approx([evidence()], abs=1e-4)
     precision = torch.eye(2, dtype=torch.float64) + X.T @ X / NOISE**2
     exact = torch.linalg.solve(precision, X.T @ Y / NOISE**2)
@@ -60,19 +62,42 @@ def test_where_the_posterior_is_normal_nothing_is_trained():
 def test_where_it_is_not_svi_raises_the_elbo():
     start = {"sd": torch.ones((), dtype=torch.float64)}
     found = variational(skewed, (Y,), start, Run(), Schedule(300, 32))
-    assert found.message != AS_GOOD
+    assert "Laplace" not in found.message
     assert len(found.elbo) > 50
     potential = Potential(skewed, (Y,), start)
-    centre, root = (torch.as_tensor(x) for x in potential.laplace(start))
+    centre, root = (torch.as_tensor(x) for x in laplace(potential, start))
     many = torch.cat([log_weights(potential, centre, root, seed) for seed in range(40)])
     assert 0.5 * many.var() > CLOSE
     assert found.elbo[-50:].mean() > many.mean()
 
 
+def test_what_svi_makes_worse_is_not_taken():
+    """Two long steps from the best normal, in units of its standard deviations."""
+    start = {"sd": torch.ones((), dtype=torch.float64)}
+    schedule = Schedule(2, 2, learning_rate=2.0)
+    found = variational(skewed, (Y,), start, Run(), schedule)
+    assert found.message == NO_BETTER
+    potential = Potential(skewed, (Y,), start)
+    centre, root = (torch.as_tensor(x) for x in laplace(potential, start))
+    torch.testing.assert_close(found.guide.scale_tril[0], root)
+    level = log_weights(potential, centre, root, 0).mean()
+    assert found.elbo == pytest.approx([float(level)])
+
+
+def test_a_divergence_that_svi_would_not_mend_is_left():
+    start = {"sd": torch.ones((), dtype=torch.float64)}
+    potential = Potential(skewed, (Y,), start)
+    centre, root = (torch.as_tensor(x) for x in laplace(potential, start))
+    off = 0.5 * float(log_weights(potential, centre, root, 0).var())
+    for close, trained in ((0.9 * off, True), (1.1 * off, False)):
+        found = variational(skewed, (Y,), start, Run(), Schedule(100, 32), close=close)
+        assert (found.message != AS_GOOD.format(close)) == trained
+
+
 def test_log_weights_are_the_divergence_of_a_wrong_normal():
     """Of a normal that is too wide by known factors: KL in closed form, and half the variance."""
     potential = Potential(normal, (Y,), {"w": torch.zeros(2, dtype=torch.float64)})
-    centre, root = potential.laplace({"w": torch.zeros(2, dtype=torch.float64)})
+    centre, root = laplace(potential, {"w": torch.zeros(2, dtype=torch.float64)})
     wide = torch.as_tensor(root) * 1.1
     many = torch.cat([
         log_weights(potential, torch.as_tensor(centre), wide, seed) for seed in range(60)
@@ -88,7 +113,7 @@ def test_svi_begins_with_the_width_of_the_highest_elbo(factor, share):
     """A normal that is so many times too wide; of the shares that are tried the nearest."""
     start = {"w": torch.zeros(2, dtype=torch.float64)}
     potential = Potential(normal, (Y,), start)
-    centre, root = (torch.as_tensor(x) for x in potential.laplace(start))
+    centre, root = (torch.as_tensor(x) for x in laplace(potential, start))
     wide = factor * root
     torch.testing.assert_close(best_width(potential, centre, wide, 0), share * wide)
 
@@ -102,7 +127,7 @@ def test_walls_that_the_curvature_at_the_mode_does_not_show():
 
     start = {"x": torch.zeros((), dtype=torch.float64)}
     potential = Potential(walls, (Y,), start)
-    centre, root = (torch.as_tensor(x) for x in potential.laplace(start))
+    centre, root = (torch.as_tensor(x) for x in laplace(potential, start))
     # The prior's curvature is 1; differences over 1e-4 see 0.0064 more of the walls.
     assert float(root) == pytest.approx(1.0, rel=0.01)
     narrow = best_width(potential, centre, root, 0)

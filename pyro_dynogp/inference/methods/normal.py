@@ -20,6 +20,7 @@ from pyro.infer.autoguide import (
 from torch import Tensor
 
 from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.laplace import fisher_normal, laplace
 from pyro_dynogp.inference.methods.svi import Schedule, train
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.run import Run
@@ -28,7 +29,8 @@ from pyro_dynogp.layers.sites import Arguments, Program
 # Divergence of Laplace's approximation from the posterior [nats] that SVI does not mend, the draws
 # that it is found from, and what is said then.
 CLOSE, WEIGHTS = 0.05, 32
-AS_GOOD = "Laplace's approximation is the posterior to 0.05 nats"
+AS_GOOD = "Laplace's approximation is the posterior to {} nats"
+NO_BETTER = "Laplace's approximation has a higher ELBO than SVI came to"
 # Shares of Laplace's standard deviations with which SVI may begin.
 NARROWER = (1.0, 0.5, 0.25, 0.125)
 
@@ -78,13 +80,19 @@ def variational(
     independent: bool = False,
     key: str = "posterior",
     fixed: dict[str, Tensor] | None = None,
+    close: float = CLOSE,
 ) -> VariationalPosterior:
     """Fit a multivariate normal to the posterior by Pyro's SVI, from values near its mode.
 
     With `independent` its covariance is diagonal (Pyro's AutoDiagonalNormal). Stops early when the
     ELBO, averaged over 50 steps, has not risen by 0.05 nats in 200 steps, and does not start where
-    Laplace's approximation has less than that to gain, as on long records. `fixed` are values of
-    sites that are none of it.
+    Laplace's approximation, or one that is narrower, has less than `close` nats to gain, as on long
+    records. Where few steps lower the ELBO the normal that they began at is kept.
+
+    Args:
+        model, args: what is fitted. values: near the mode. run, schedule: of SVI.
+        independent: see above. key: of checkpoints.
+        fixed: values of sites that are none of it. close: see above.
     """
     potential = Potential(model, args, values, fixed)
     model = potential.model
@@ -95,24 +103,40 @@ def variational(
         slower = replace(schedule, learning_rate=0.2 * schedule.learning_rate)
         return _trained(potential, guide, run, slower, key)
 
-    def laplace() -> dict[str, Tensor]:
-        centre, root = potential.laplace(values)
+    def normal() -> dict[str, Tensor]:
+        near = fisher_normal(potential, values) if fixed else None
+        centre, root = near or laplace(potential, values)
         return {"centre": torch.as_tensor(centre), "root": torch.as_tensor(root)}
 
-    found = run.checkpoints.piece(f"{key}-laplace", laplace)
+    found = run.checkpoints.piece(f"{key}-laplace", normal)
     centre, root = found["centre"], found["root"]
-    weights = run.checkpoints.piece(
-        f"{key}-weights", lambda: {"log": log_weights(potential, centre, root, run.seed)}
-    )["log"]
-    if 0.5 * float(weights.var()) <= CLOSE:
-        elbo = np.array([float(weights.mean())])
-        return VariationalPosterior(Mixture.normal(potential, centre, root), elbo, AS_GOOD)
-    root = run.checkpoints.piece(
-        f"{key}-root", lambda: {"root": best_width(potential, centre, root, run.seed)}
-    )["root"]
+
+    def weights(root: Tensor) -> Tensor:
+        return log_weights(potential, centre, root, run.seed)
+
+    found = run.checkpoints.piece(f"{key}-weights", lambda: {"log": weights(root)})
+    if not _near(found["log"], close):
+        narrower = best_width(potential, centre, root, run.seed)
+        found = run.checkpoints.piece(
+            f"{key}-root", lambda: {"root": narrower, "log": weights(narrower)}
+        )
+        root = found["root"]
+    level = float(found["log"].mean())
+    before = VariationalPosterior(
+        Mixture.normal(potential, centre, root), np.array([level]), AS_GOOD.format(close)
+    )
+    if _near(found["log"], close):
+        return before
     start = {name: value.detach() for name, value in potential.unpack(centre).items()}
     guide = PreconditionedNormal(model, centre, root, init_loc_fn=init_to_value(values=start))
-    return _trained(potential, guide, run, schedule, key)
+    trained = _trained(potential, guide, run, schedule, key)
+    after = log_weights(potential, trained.guide.loc[0], trained.guide.scale_tril[0], run.seed)
+    return trained if float(after.mean()) > level else replace(before, message=NO_BETTER)
+
+
+def _near(weights: Tensor, close: float) -> bool:
+    """Whether draws with such log weights (S,) say that their normal is as near as this."""
+    return 0.5 * float(weights.var()) <= close
 
 
 def _trained(
@@ -158,6 +182,6 @@ def log_weights(potential: Potential, centre: Tensor, root: Tensor, seed: int) -
     """
     generator = torch.Generator().manual_seed(seed)
     x = torch.randn(WEIGHTS, len(centre), dtype=torch.float64, generator=generator)
-    energies = potential.with_jacobian((centre + x @ root.mT).numpy())[0]
+    energies = potential.energies(centre + x @ root.mT)
     log_q = -0.5 * (x.square() + math.log(2.0 * math.pi)).sum(1) - root.diagonal().log().sum()
-    return -torch.tensor(energies) - log_q
+    return -energies - log_q

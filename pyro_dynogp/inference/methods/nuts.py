@@ -15,6 +15,7 @@ from torch import Tensor
 
 from pyro_dynogp.inference.cascade_coordinates import potential_for_sampling
 from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.laplace import laplace
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.mode import best_optima, check_optimizer
 from pyro_dynogp.inference.optimise.maximum import Optimizer
@@ -196,7 +197,7 @@ def sample_posterior(
     (`within_reach`).
     """
     potential = potential_for_sampling(model, (records,), values)
-    z, root = potential.laplace(values)
+    z, root = laplace(potential, values)
     tasks = [
         _Task(
             model,

@@ -96,18 +96,23 @@ class Innovated(NamedTuple):
 
 
 class Innovations:
-    """Energies of a model, as of `Potential` without Jacobian, and their local shape.
+    """Energies of a model, as of `Potential` and `Lengths`, and their local shape.
 
     Args:
         potential: of a model for which `has_innovations` holds.
         free: entries of the unconstrained vector that vary; None for all.
+        jacobian: whether they are those of the vector's density, not of the values'.
     """
 
-    def __init__(self, potential: Potential, free: np.ndarray | None = None) -> None:
+    def __init__(
+        self, potential: Potential, free: np.ndarray | None = None, *, jacobian: bool = False
+    ) -> None:
         assert isinstance(potential.log_density, Direct)
         self.potential, self.density = potential, potential.log_density
         self.free = np.arange(potential.size) if free is None else free
-        self._linear, self._lengths = potential.linear, Lengths(potential.sites)
+        self.jacobian = jacobian
+        # Lengths are for climbs of the values' density alone.
+        self._linear, self._lengths = potential.linear, Lengths([] if jacobian else potential.sites)
         self._there = [~torch.isnan(y) for y in self.density.observations]
         model = self.density.model
         states = sum(2 * layer.modes for _, layer in model.dynamic)
@@ -165,11 +170,12 @@ class Innovations:
         """Energies (k,) of the prior at z (k, d), and their gradients (k, d)."""
         more, further = self._lengths.energies(z)
         if self._linear is not None:
-            energy, gradient = self._linear.prior_energies(z)
+            energy, gradient = self._linear.prior_energies(z, jacobian=self.jacobian)
             return energy + more, gradient + further
         x = torch.tensor(z, requires_grad=True)
         with torch.enable_grad(), pyro.validation_enabled(False):
-            energies = -self.density.prior.log_prob(self.potential.unpack(x))
+            prior = self.density.prior.log_prob(self.potential.unpack(x)) + self.density.constant
+            energies = -(prior + self.potential.log_jacobian(x) if self.jacobian else prior)
             (gradients,) = torch.autograd.grad(energies.sum(), x)
         return energies.detach().numpy() + more, gradients.numpy() + further
 
