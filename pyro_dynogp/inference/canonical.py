@@ -1,6 +1,6 @@
 r"""A problem in units, and an order of channels, that do not depend on those of the record.
 
-Climbs of functions in feedback have several ends, and amplify rounding until it decides among them.
+Climbs of models with functions have several ends, and amplify rounding until it decides among them.
 Volts and millivolts, or exchanged channels, round differently. Such a model is therefore fitted to
 signals in standard deviations, rounded to `DIGITS` digits, with channels from the smoothest to the
 roughest: the same numbers to the bit however the record states them. What is found is then put
@@ -52,12 +52,12 @@ class Canonical:
 
     @classmethod
     def of(cls, given: Problem) -> Canonical:
-        """The canonical form of models with feedback that know no units or places of channels.
+        """The canonical form of models with functions that know no units or places of channels.
 
         Others, and those that start from another fit, stay as they are stated.
         """
         model, scaling = given.model, given.scaling
-        if not model.has_feedback or given.learnt is not None or not _free(model):
+        if not model.has_function or given.learnt is not None or not _free(model):
             each = tuple(range(len(scaling.input_scale))), tuple(range(len(scaling.output_scale)))
             return cls(given, given, *each)
         driving = model.inputs - model.direct

@@ -62,27 +62,28 @@ def kernel_sites(model: Model) -> tuple[str, ...]:
 def kernels_by_evidence(
     model: Model, records: tuple[PreparedRecord, ...], optima: Sequence[Optimum], run: Run
 ) -> list[Optimum]:
-    """Of the leading optima, with kernels by the evidence, the one that has the most of it.
+    """The leading optima with kernels by the evidence, the one that has the most of it first.
 
-    Joint densities under different kernels do not compare.
+    Joint densities under different kernels do not compare. With feedback the first one alone.
 
     Raises:
         ValueError: where next to none of them predictions are finite.
     """
     if not kernel_sites(model):  # functions that are known
         return list(optima)
-    best, least = optima[0], np.inf
+    found: list[tuple[Optimum, float]] = []
     for index, one in enumerate(optima[:CONSIDERED]):
+        enough = min([np.inf, *(energy for _, energy in found)])
         key = f"kernels-{index}"
-        found, energy = with_kernels_by_evidence(model, records, one, run, key, enough=least)
-        if energy < least:
-            best, least = found, energy
-    if not np.isfinite(least):
+        found.append(with_kernels_by_evidence(model, records, one, run, key, enough=enough))
+    found = sorted([x for x in found if np.isfinite(x[1])], key=lambda x: x[1])
+    if not found:
         raise ValueError(
             "fit: next to the best optimum predictions run away, so that kernels of functions "
             "cannot be learnt. Take another seed, fewer pairs, or a longer record."
         )
-    return [best]
+    kept = found[:1] if model.has_feedback else found
+    return [one for one, energy in kept if energy < found[0][1] + BEHIND]
 
 
 def with_kernels_by_evidence(

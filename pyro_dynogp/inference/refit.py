@@ -40,8 +40,8 @@ from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import seeded
 
-# Iterations from the old optima, and of Adam and SVI where they are of a model with functions.
-SAME_STEPS, ADAM_STEPS, SVI_STEPS = 300, 200, 400
+# Iterations from the old optima, and of SVI.
+SAME_STEPS, SVI_STEPS = 300, 400
 # Iterations of extended models: linear, others of the same layers, with a layer more.
 LINEAR_STEPS, LAYERED_STEPS = 100, 100
 ADDED_STEPS: Mapping[str, int] = MappingProxyType({"gauss-newton": 60, "lbfgs": 300, "adam": 300})
@@ -51,7 +51,7 @@ FRESH, FRESH_STEPS = 4, 40
 # Of the same model every start goes on, near its optimum; of a linear one that is extended half of
 # them do, side by side, as processors are kept busy by other trials. With feedback all go on: after
 # few iterations their order says little (of nine plants two chose a start 180 nats below another).
-AGAIN = Effort(kept=1.0, rate=0.004, near=True)
+AGAIN = Effort(kept=1.0, near=True)
 EXTENDED, LOOPED = Effort(kept=1 / 2, together=8), Effort(kept=1.0, together=8)
 # Samples from which what is new in feedback is looked for along an excerpt first, and its length:
 # an iteration goes through the filter once for each of some hundred numbers.
@@ -121,7 +121,7 @@ def race(
 
     def first(model: Model) -> str:
         layered = len(model.layers) > len(fit.model.layers)
-        return optimizer_for(model) if layered else optimizer_near(model)
+        return _optimizer_of_layer(model) if layered else optimizer_near(model)
 
     for model in models:
         try:
@@ -166,34 +166,26 @@ def _problem(model: Model, records: Sequence[Record]) -> Problem:
 
 
 def _again(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
-    """Optima of the same model: of functions by Adam, as before, but where the mode is wanted.
-
-    Better optimisers leave an optimum of a model with functions along its ridges.
-    """
+    """Optima of the same model."""
     model = problem.target
-    adam = model.has_function and fit.method != "map" and not model.has_feedback
-    steps = run.steps or (ADAM_STEPS if adam else SAME_STEPS)
-    optimizer = "adam" if adam else optimizer_near(model)
+    optimizer = optimizer_near(model)
     optima = maximise(
-        model, problem.records, optima_of(fit), run, optimizer=optimizer, steps=steps,
-        effort=AGAIN, held=_held(model, optimizer),
+        model, problem.records, optima_of(fit), run, optimizer=optimizer,
+        steps=run.steps or SAME_STEPS, effort=AGAIN, held=kernel_sites(model),
     )  # fmt: skip
     return _settled(problem, optima, run)
 
 
-def _held(model: Model, optimizer: Optimizer) -> tuple[str, ...]:
-    """Sites that keep what is learnt: kernels while Gauss-Newton climbs, see `optimizer_near`.
-
-    With feedback whatever climbs: their kernels are those of the evidence, see `_settled`.
-    """
-    held = model.has_feedback or optimizer == "gauss-newton"
-    return kernel_sites(model) if held else ()
+def _optimizer_of_layer(model: Model) -> Optimizer:
+    """The optimizer of a layer that is added, see `_climbed`."""
+    forward = model.has_function and not model.has_feedback
+    return "adam" if forward else optimizer_for(model)
 
 
 def _settled(problem: Problem, optima: list[Optimum], run: Run) -> list[Optimum]:
     """The best optimum with kernels by the evidence; without feedback, and of variants, all optima.
 
-    Variants are compared at the mode, and others have climbed from the same values.
+    Variants are compared at the mode, and others keep the kernels that they have.
     """
     if run.steps or not problem.target.has_feedback:
         return optima
@@ -214,7 +206,7 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     optimizer = optimizer_near(target)
     optima = maximise(
         target, problem.records, [best.values], run, optimizer=optimizer, steps=LAYERED_STEPS,
-        effort=AGAIN, held=_held(target, optimizer),
+        effort=AGAIN, held=kernel_sites(target),
     )  # fmt: skip
     return _settled(problem, optima, run)
 
@@ -222,13 +214,13 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
 def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     """Optima of a model that extends that of a fit.
 
-    With a layer more Adam climbs, as in a first fit: better optimisers get to modes of a free
-    function that fit the noise (one that is flat where outputs repeat) and of which its special
-    cases have none, so that gains would be those of climbs. With feedback Gauss-Newton climbs, and
-    kernels are then those of the highest evidence. Where the function is far from a line (a sensor
-    that reports a size) the linear fit is any of several poor optima: such a model starts from
-    linear fits of its own, too; a function in feedback from what is learnt, where nothing comes
-    back as yet.
+    Kernels keep what is learnt. With a layer more they are free, and Adam climbs: better optimisers
+    find functions that fit the noise (one that is flat where outputs repeat, with next to no noise
+    beyond it) and of which special cases have none, so that gains would be those of climbs. With
+    feedback Gauss-Newton climbs, and kernels are then those of the highest evidence. Where the
+    function is far from a line (a sensor that reports a size) the linear fit is any of several poor
+    optima: such a model starts from linear fits of its own, too; a function in feedback from what
+    is learnt, where nothing comes back as yet.
 
     A linear model with more poles has the starts of a first fit, too: what is new may take the
     place of what is learnt.
@@ -244,7 +236,7 @@ def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
         optimizer = optimizer_near(model)
         return maximise(
             model, records, points, run, optimizer=optimizer, steps=run.steps or usual,
-            effort=effort, held=_held(model, optimizer),
+            effort=effort, held=kernel_sites(model),
         )  # fmt: skip
 
     if target.is_linear:
@@ -257,7 +249,7 @@ def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     if len(target.layers) > len(fit.model.layers):
         if not (run.steps or (target.has_feedback and fit.model.is_linear)):
             starts += starting_points(target, records, run, count=FRESH, steps=FRESH_STEPS)
-        optimizer = optimizer_for(target)
+        optimizer = _optimizer_of_layer(target)
         return climb(target, records, starts, [], run, optimizer=optimizer, effort=effort,
                      steps=run.steps or ADDED_STEPS[optimizer])  # fmt: skip
     if run.steps:  # a few, to compare variants

@@ -216,9 +216,9 @@ class Prediction:
             z = (found - mean) / sd
             excess = self._average(ndtr(z)) - level
             low, high = np.where(excess < 0, found, low), np.where(excess < 0, high, found)
-            density = self._average(np.exp(-0.5 * z**2) / (ROOT_TWO_PI * sd))
             # Newton's step, or to the middle of what is left where that leads out of it or is slow.
-            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore", under="ignore"):
+                density = self._average(np.exp(-0.5 * z**2) / (ROOT_TWO_PI * sd))
                 step = -excess / density
             settled = np.minimum(np.abs(step), high - low) <= RESOLUTION * sd.min(0)
             if settled.all():

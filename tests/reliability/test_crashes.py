@@ -54,7 +54,7 @@ from tests.inference.cascades import wiener, wiener_record
 def test_a_fit_without_room_keeps_what_is_finished_and_goes_on_later(whole, tmp_path):
     """The largest file of a process is limited, as a disk that is full limits it."""
     limited = f"""{FIT}
-resource.setrlimit(resource.RLIMIT_FSIZE, (4000, 4000))
+resource.setrlimit(resource.RLIMIT_FSIZE, (1600, 1600))
 dgp.fit(wiener(), wiener_record(), checkpoint=sys.argv[2], **OPTIONS)
 """
     said = in_a_process(limited, tmp_path)

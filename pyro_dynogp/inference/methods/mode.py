@@ -99,14 +99,13 @@ def _faint(values: Values) -> Values:
 class Mode:
     """The posterior mode: the best optimum of several starts.
 
-    With feedback kernels and output scales of functions are those of the highest evidence, and all
-    else is at its mode given them, see `function_evidence`.
+    Kernels and output scales of functions are those of the highest evidence, and all else is at its
+    mode given them, see `function_evidence`.
 
     Attributes:
-        optimizer: "gauss-newton" (under Gaussian noise), "lbfgs",
-            "preconditioned" (L-BFGS in coordinates that Hessians make round, which gets to the top
-            of long ridges) or "adam"; None for what suits the model, see `optimizer_for`. The
-            highest mode may be one that fits the noise.
+        optimizer: "gauss-newton" (under Gaussian noise), "lbfgs", "preconditioned" (L-BFGS in
+            coordinates that Hessians make round, which gets to the top of long ridges) or "adam";
+            None for what suits the model, see `optimizer_for`.
 
     Raises:
         ValueError: on an unknown optimizer.
@@ -180,9 +179,7 @@ def best_optima(
             "fit: no start reached a point where the likelihood can be evaluated. Check the "
             "record for jumps of many orders of magnitude, or try fewer pairs."
         )
-    if model.has_feedback:
-        optima = kernels_by_evidence(problem.target, problem.records, optima, run)
-    return optima
+    return kernels_by_evidence(problem.target, problem.records, optima, run)
 
 
 def _near(

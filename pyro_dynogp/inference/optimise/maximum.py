@@ -56,14 +56,12 @@ class Effort:
 
     Attributes:
         kept: share of the starts that climbs to the end.
-        rate: Adam's first step, in unconstrained units.
         together: most starts that climb side by side where evaluating them at once pays.
         near: whether starts are near their optima: optimisers that make use of the curvature do so
             at once.
     """
 
     kept: float = 1 / 3
-    rate: float = RATE
     together: int = TOGETHER
     near: bool = False
 
@@ -86,7 +84,6 @@ class _Task:
     steps: int
     run: Run
     key: str
-    rate: float
     goes_on: bool
     last: bool
     held: tuple[str, ...] = ()
@@ -109,7 +106,7 @@ def _preconditioned(functions: Functions, z: np.ndarray, task: _Task, every: int
 
 def _adam(functions: Functions, z: np.ndarray, task: _Task, every: int) -> Climb:
     del every  # of Hessians, of which it has none
-    return adam(functions, z, task.steps, task.rate)
+    return adam(functions, z, task.steps, RATE)
 
 
 _METHODS = {"lbfgs": _lbfgs, "preconditioned": _preconditioned, "adam": _adam}
@@ -241,7 +238,6 @@ def maximise(
                 count,
                 run,
                 f"{key}-{label}-{i}",
-                effort.rate,
                 effort.near or label.startswith("optima"),
                 last,
                 tuple(held),
@@ -294,20 +290,10 @@ def _stages(
 
 
 def optimizer_for(model: Model) -> Optimizer:
-    """Gauss-Newton under Gaussian noise for linear models and with feedback, Adam for functions.
-
-    Else L-BFGS. Of other models with functions Gauss-Newton finds higher modes, but with output
-    scales and short lengthscales that make the functions less certain than they are. With feedback
-    kernels are found by the evidence afterwards, and L-BFGS stops far below the top.
-    """
-    if has_innovations(model) and (model.is_linear or model.has_feedback):
-        return "gauss-newton"
-    return "adam" if model.has_function and not model.has_feedback else "lbfgs"
+    """The optimizer of a first fit: Gauss-Newton under Gaussian noise, else L-BFGS."""
+    return "gauss-newton" if has_innovations(model) else "lbfgs"
 
 
 def optimizer_near(model: Model) -> Optimizer:
-    """The optimizer that goes on from near an optimum: Gauss-Newton under Gaussian noise.
-
-    Where functions are, their kernels are to be held: see `optimizer_for`.
-    """
+    """The optimizer that goes on from near an optimum: Gauss-Newton under Gaussian noise."""
     return "gauss-newton" if has_innovations(model) else "preconditioned"
