@@ -40,8 +40,8 @@ from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 from pyro_dynogp.support.parallel import seeded
 
-# Iterations from the old optima, and of SVI.
-SAME_STEPS, SVI_STEPS = 300, 400
+# Iterations from the old optima, and of Adam and SVI where they are of a model with functions.
+SAME_STEPS, ADAM_STEPS, SVI_STEPS = 300, 200, 400
 # Iterations of extended models: linear, others of the same layers, with a layer more.
 LINEAR_STEPS, LAYERED_STEPS = 100, 100
 ADDED_STEPS: Mapping[str, int] = MappingProxyType({"gauss-newton": 60, "lbfgs": 300, "adam": 300})
@@ -51,7 +51,7 @@ FRESH, FRESH_STEPS = 4, 40
 # Of the same model every start goes on, near its optimum; of a linear one that is extended half of
 # them do, side by side, as processors are kept busy by other trials. With feedback all go on: after
 # few iterations their order says little (of nine plants two chose a start 180 nats below another).
-AGAIN = Effort(kept=1.0, near=True)
+AGAIN = Effort(kept=1.0, rate=0.004, near=True)
 EXTENDED, LOOPED = Effort(kept=1 / 2, together=8), Effort(kept=1.0, together=8)
 # Samples from which what is new in feedback is looked for along an excerpt first, and its length:
 # an iteration goes through the filter once for each of some hundred numbers.
@@ -166,12 +166,17 @@ def _problem(model: Model, records: Sequence[Record]) -> Problem:
 
 
 def _again(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
-    """Optima of the same model."""
+    """Optima of the same model: by Adam where a first fit is, but where the mode is wanted.
+
+    Better optimisers leave such an optimum along its ridges.
+    """
     model = problem.target
-    optimizer = optimizer_near(model)
+    adam = fit.method != "map" and optimizer_for(model) == "adam"
+    steps = run.steps or (ADAM_STEPS if adam else SAME_STEPS)
+    optimizer = "adam" if adam else optimizer_near(model)
     optima = maximise(
-        model, problem.records, optima_of(fit), run, optimizer=optimizer,
-        steps=run.steps or SAME_STEPS, effort=AGAIN, held=kernel_sites(model),
+        model, problem.records, optima_of(fit), run, optimizer=optimizer, steps=steps,
+        effort=AGAIN, held=_held(model, optimizer),
     )  # fmt: skip
     return _settled(problem, optima, run)
 
@@ -180,6 +185,15 @@ def _optimizer_of_layer(model: Model) -> Optimizer:
     """The optimizer of a layer that is added, see `_climbed`."""
     forward = model.has_function and not model.has_feedback
     return "adam" if forward else optimizer_for(model)
+
+
+def _held(model: Model, optimizer: Optimizer) -> tuple[str, ...]:
+    """Sites that keep what is learnt: kernels that are those of the evidence, see `_settled`.
+
+    And others while Gauss-Newton climbs, which would make the functions less certain.
+    """
+    held = optimizer == "gauss-newton" or optimizer_for(model) != "adam"
+    return kernel_sites(model) if held else ()
 
 
 def _settled(problem: Problem, optima: list[Optimum], run: Run) -> list[Optimum]:
@@ -206,7 +220,7 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     optimizer = optimizer_near(target)
     optima = maximise(
         target, problem.records, [best.values], run, optimizer=optimizer, steps=LAYERED_STEPS,
-        effort=AGAIN, held=kernel_sites(target),
+        effort=AGAIN, held=_held(target, optimizer),
     )  # fmt: skip
     return _settled(problem, optima, run)
 
@@ -214,13 +228,13 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
 def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     """Optima of a model that extends that of a fit.
 
-    Kernels keep what is learnt. With a layer more they are free, and Adam climbs: better optimisers
-    find functions that fit the noise (one that is flat where outputs repeat, with next to no noise
-    beyond it) and of which special cases have none, so that gains would be those of climbs. With
-    feedback Gauss-Newton climbs, and kernels are then those of the highest evidence. Where the
-    function is far from a line (a sensor that reports a size) the linear fit is any of several poor
-    optima: such a model starts from linear fits of its own, too; a function in feedback from what
-    is learnt, where nothing comes back as yet.
+    With a layer more Adam climbs: better optimisers find functions that fit the noise (one that is
+    flat where outputs repeat, with next to no noise beyond it) and of which special cases have
+    none, so that gains would be those of climbs. With feedback Gauss-Newton climbs, and
+    kernels are then those of the highest evidence. Where the function is far from a line (a sensor
+    that reports a size) the linear fit is any of several poor optima: such a model starts from
+    linear fits of its own, too; a function in feedback from what is learnt, where nothing comes
+    back as yet.
 
     A linear model with more poles has the starts of a first fit, too: what is new may take the
     place of what is learnt.
@@ -236,7 +250,7 @@ def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
         optimizer = optimizer_near(model)
         return maximise(
             model, records, points, run, optimizer=optimizer, steps=run.steps or usual,
-            effort=effort, held=kernel_sites(model),
+            effort=effort, held=_held(model, optimizer),
         )  # fmt: skip
 
     if target.is_linear:

@@ -32,7 +32,11 @@ FIRST, STEP, AHEAD = 1000, 0.1, 500
 MODELS: dict[str, Callable[[], dgp.Model]] = {
     "Hammerstein": lambda: dgp.Hammerstein(1, pairs=2),
     "Wiener": lambda: dgp.Wiener(1, pairs=2),
+    "Wiener, no process noise": lambda: dgp.Wiener(1, pairs=2, process_noise=False),
     "Wiener-Hammerstein": lambda: dgp.WienerHammerstein(1, pairs=(2, 2)),
+    "Wiener-Hammerstein, no process noise": lambda: dgp.WienerHammerstein(
+        1, pairs=(2, 2), process_noise=False
+    ),
 }
 
 
@@ -57,7 +61,7 @@ def plant(kind: str, seed: int, samples: int) -> tuple[dgp.Record, dgp.Record, f
     else:
         x = filtered(rng, u)
         y = f(size * x / x.std())
-        y = filtered(rng, y) if kind == "Wiener-Hammerstein" else y
+        y = filtered(rng, y) if kind.startswith("Wiener-Hammerstein") else y
     noise = NOISE[seed % len(NOISE)]
     y = (y - y.mean()) / y.std() + noise * rng.normal(size=n)
     record = dgp.Record(np.arange(n) * STEP, u[:, None], y[:, None])

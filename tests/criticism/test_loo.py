@@ -360,8 +360,9 @@ def test_the_mode_of_a_cascade_is_no_posterior(bent, monkeypatch):
     assert np.isfinite(found.elpd_loo)
 
 
-def test_a_cascade_with_its_optima(bent):
+def test_a_cascade_with_its_optima(bent, monkeypatch):
     """Ratios of inducing values and first states are good; what they leave out is said."""
+    monkeypatch.setattr("pyro_dynogp.inference.refit.ADAM_STEPS", 60)
     N = 40
     options = {"restarts": 1, "steps": 60}
     fit = dgp.fit(dgp.Wiener(1, pairs=1, inducing=5), bent[:N], method="svi", **options, **QUIET)

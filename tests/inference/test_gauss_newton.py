@@ -243,12 +243,14 @@ def test_which_models_have_innovations():
 
 def test_which_optimizer_climbs():
     two = dgp.Cascade(1, (dgp.Dynamic(), dgp.Dynamic()))
-    models = Linear(1), dgp.Wiener(1), dgp.NonlinearFeedback(1), two
+    models = Linear(1), dgp.Hammerstein(1), dgp.NonlinearFeedback(1), two
     assert {optimizer_for(m) for m in models} == {"gauss-newton"}
-    assert optimizer_for(dgp.Wiener(1, likelihood=dgp.StudentT())) == "lbfgs"
-    assert {optimizer_near(m) for m in models} == {"gauss-newton"}
+    assert optimizer_for(dgp.Wiener(1, process_noise=False)) == "gauss-newton"
+    noisy = dgp.Wiener(1), dgp.Wiener(1, likelihood=dgp.StudentT()), dgp.WienerHammerstein(1)
+    assert {optimizer_for(m) for m in noisy} == {"adam"}  # functions that see process noise
+    assert {optimizer_near(m) for m in (*models, dgp.Wiener(1))} == {"gauss-newton"}
     assert optimizer_near(dgp.Wiener(1, likelihood=dgp.StudentT())) == "preconditioned"
-    for make in (Linear, dgp.NonlinearFeedback):
+    for make in (Linear, dgp.NonlinearFeedback, dgp.Hammerstein):
         assert optimizer_for(make(1, likelihood=dgp.StudentT())) == "lbfgs"
 
 

@@ -56,7 +56,7 @@ def test_a_cascade_keeps_its_optima(bent):
 
 
 @pytest.mark.parametrize("method", ["map", "svi"])
-def test_kernels_are_held_while_gauss_newton_climbs(bent, monkeypatch, method):
+def test_kernels_are_held_while_gauss_newton_climbs_and_not_by_adam(bent, monkeypatch, method):
     fit = dgp.fit(wiener(), bent, **{**FAST, "method": "svi"})
     fit = fit if method == "svi" else fit.at_mode()
     climbs = []
@@ -68,7 +68,18 @@ def test_kernels_are_held_while_gauss_newton_climbs(bent, monkeypatch, method):
 
     monkeypatch.setattr(refits, "maximise", spied)
     refit(fit, bent, run=Run(0, workers=1, steps=3))
-    assert climbs == [("gauss-newton", True)]
+    assert climbs == [("gauss-newton", True) if method == "map" else ("adam", False)]
+
+
+def test_kernels_of_the_evidence_are_held_whatever_climbs():
+    for make in (dgp.NonlinearFeedback, dgp.Hammerstein):
+        for options in ({}, {"likelihood": dgp.StudentT()}):
+            model = make(1, **options)
+            held = refits._held(model, refits.optimizer_near(model))
+            assert held == refits.kernel_sites(model) != ()
+    noisy = dgp.Wiener(1, likelihood=dgp.StudentT())
+    assert refits._held(noisy, refits.optimizer_near(noisy)) == ()
+    assert refits._held(dgp.LinearDynamicGP(1), "gauss-newton") == ()
 
 
 def test_what_is_refused(map_fit, layered_fit, record):

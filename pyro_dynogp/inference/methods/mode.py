@@ -100,7 +100,8 @@ class Mode:
     """The posterior mode: the best optimum of several starts.
 
     Kernels and output scales of functions are those of the highest evidence, and all else is at its
-    mode given them, see `function_evidence`.
+    mode given them, see `function_evidence`; not where Adam climbs, as it does in forward cascades
+    whose static layers see process noise, see `optimizer_for`.
 
     Attributes:
         optimizer: "gauss-newton" (under Gaussian noise), "lbfgs", "preconditioned" (L-BFGS in
@@ -179,6 +180,8 @@ def best_optima(
             "fit: no start reached a point where the likelihood can be evaluated. Check the "
             "record for jumps of many orders of magnitude, or try fewer pairs."
         )
+    if optimizer == "adam" and not model.has_feedback:
+        return optima  # which ends before kernels fit the noise
     return kernels_by_evidence(problem.target, problem.records, optima, run)
 
 

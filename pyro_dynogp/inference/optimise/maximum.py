@@ -26,6 +26,7 @@ from pyro_dynogp.layers.sites import Program
 from pyro_dynogp.models.gauge import in_gauge
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import Records, as_measured
+from pyro_dynogp.models.variants import without_noise_below_functions
 from pyro_dynogp.support.parallel import parallel_map, seeded
 
 # End, energies on the way, why it ended.
@@ -56,12 +57,14 @@ class Effort:
 
     Attributes:
         kept: share of the starts that climbs to the end.
+        rate: Adam's first step, in unconstrained units.
         together: most starts that climb side by side where evaluating them at once pays.
         near: whether starts are near their optima: optimisers that make use of the curvature do so
             at once.
     """
 
     kept: float = 1 / 3
+    rate: float = RATE
     together: int = TOGETHER
     near: bool = False
 
@@ -84,6 +87,7 @@ class _Task:
     steps: int
     run: Run
     key: str
+    rate: float
     goes_on: bool
     last: bool
     held: tuple[str, ...] = ()
@@ -106,7 +110,7 @@ def _preconditioned(functions: Functions, z: np.ndarray, task: _Task, every: int
 
 def _adam(functions: Functions, z: np.ndarray, task: _Task, every: int) -> Climb:
     del every  # of Hessians, of which it has none
-    return adam(functions, z, task.steps, RATE)
+    return adam(functions, z, task.steps, task.rate)
 
 
 _METHODS = {"lbfgs": _lbfgs, "preconditioned": _preconditioned, "adam": _adam}
@@ -238,6 +242,7 @@ def maximise(
                 count,
                 run,
                 f"{key}-{label}-{i}",
+                effort.rate,
                 effort.near or label.startswith("optima"),
                 last,
                 tuple(held),
@@ -290,7 +295,16 @@ def _stages(
 
 
 def optimizer_for(model: Model) -> Optimizer:
-    """The optimizer of a first fit: Gauss-Newton under Gaussian noise, else L-BFGS."""
+    """The optimizer of a first fit: Gauss-Newton under Gaussian noise, else L-BFGS, or Adam.
+
+    Where static layers see process noise the highest modes explain with it what dynamics and
+    functions should, and free runs are poor: on the measured circuit (8192 samples) the mode by
+    Gauss-Newton is 14 000 nats above that of 300 steps of Adam, and its error on the multisine is
+    100 mV, not 36 mV. Adam stops before. With feedback free runs tell whether noise stays.
+    """
+    noisy = without_noise_below_functions(model) != model
+    if noisy and model.has_function and not model.has_feedback:
+        return "adam"
     return "gauss-newton" if has_innovations(model) else "lbfgs"
 
 
