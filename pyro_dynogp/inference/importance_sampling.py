@@ -265,9 +265,8 @@ def weighed(potential: Potential, optima: Sequence[Values]) -> tuple[list[Values
     probabilities are for the importance ratios to say.
     """
     different = distinct(potential, optima)
-    evidence = torch.tensor(
-        [log_evidence(potential, one) for one in different], dtype=torch.float64
-    )
+    each = [log_evidence(potential, one) for one in different]
+    evidence = torch.tensor(each, dtype=torch.float64)
     order, weights = heaviest(evidence, different[0], least=LEAST_WEIGHT, most=MOST_OPTIMA)
     return [different[index] for index in order], weights
 

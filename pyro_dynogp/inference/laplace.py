@@ -77,8 +77,7 @@ def log_evidence(potential: Potential, values: Mapping[str, Tensor]) -> float:
     """
     z = potential.pack(values).numpy()
     innovations = _innovations(potential)
-    with_function = innovations is not None and innovations.has_functions
-    here = innovations.local(z) if innovations is not None and with_function else None
+    here = innovations.local(z) if innovations and innovations.has_functions else None
     if here is None:
         energy = potential.value_and_gradient(z, jacobian=True)[0]
         matrix = potential.hessian(z, step=1e-3)

@@ -91,8 +91,8 @@ def variational(
 
     Args:
         model, args: what is fitted. values: near the mode. run, schedule: of SVI.
-        independent: see above. key: of checkpoints.
-        fixed: values of sites that are none of it. close: see above.
+        independent, close: see above. key: of checkpoints.
+        fixed: values of sites that are none of it.
     """
     potential = Potential(model, args, values, fixed)
     model = potential.model
@@ -116,10 +116,12 @@ def variational(
 
     found = run.checkpoints.piece(f"{key}-weights", lambda: {"log": weights(root)})
     if not _near(found["log"], close):
-        narrower = best_width(potential, centre, root, run.seed)
-        found = run.checkpoints.piece(
-            f"{key}-root", lambda: {"root": narrower, "log": weights(narrower)}
-        )
+
+        def narrower(widest: Tensor = root) -> dict[str, Tensor]:
+            best = best_width(potential, centre, widest, run.seed)
+            return {"root": best, "log": weights(best)}
+
+        found = run.checkpoints.piece(f"{key}-root", narrower)
         root = found["root"]
     level = float(found["log"].mean())
     before = VariationalPosterior(
