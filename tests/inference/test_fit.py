@@ -273,4 +273,5 @@ class TestWarmStart:
         wiener = dgp.Wiener(1, pairs=2, inducing=5, process_noise=False)
         begun = dgp.fit(wiener, record[:60], start=map_fit, **options)
         fresh = dgp.fit(wiener, record[:60], **options)
-        assert begun.start_energies.min() <= fresh.start_energies.min()
+        # A fit without a start is to signals rounded to nine digits.
+        assert begun.start_energies.min() <= fresh.start_energies.min() + 1e-5
