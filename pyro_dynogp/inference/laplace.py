@@ -48,7 +48,7 @@ def fisher_normal(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """The same by Gauss-Newton, with the Fisher matrix for the Hessian.
 
-    None where there is no such matrix: with noise that is not Gaussian, of models that are not this
+    None where there is no such matrix: where the last layer has limits, of models that are not this
     library's, at an edge of what can be evaluated.
     """
     innovations = _innovations(potential)

@@ -58,8 +58,7 @@ class MomentOutputs(OutputProcess):
         """Log-density (*s, *batch) of outputs (*s, *batch, *event) [nats]."""
         problem = self._problem(value)
         if lanes_serve(problem) and not problem.wants_gradient:
-            error, variance = (torch.from_numpy(x) for x in innovate_together(problem))
-            total = _normal_density(error, variance).nansum((-2, -1))
+            total = torch.from_numpy(innovate_together(problem)[2]).nansum((-2, -1))
         else:
             total = log_density(problem)
         there = (~torch.isnan(self.columns(value))).to(torch.float64)
@@ -96,10 +95,12 @@ class MomentOutputs(OutputProcess):
         """Scaled innovations (*b, n, n_y), variances, and what log-densities have beyond normal."""
         problem = self._problem(y)
         if lanes_serve(problem):
-            both = innovate_together(problem)
-            error, variance = (torch.from_numpy(x)[..., :: self.system.substeps, :] for x in both)
-            return error, variance, torch.zeros_like(error)
-        error, variance, density = self._pass(y, smoothing.innovate)
+            found = (torch.from_numpy(x) for x in innovate_together(problem))
+            error, variance, density = (x[..., :: self.system.substeps, :] for x in found)
+            if self.system.noise.likelihood.gaussian:
+                return error, variance, torch.zeros_like(error)
+        else:
+            error, variance, density = self._pass(y, smoothing.innovate)
         return error, variance, density - _normal_density(error, variance)
 
     def one_step(self, y: Tensor) -> Moments:

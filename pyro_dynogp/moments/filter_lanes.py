@@ -1,9 +1,8 @@
 r"""The filter's predictions one step ahead for points in lanes, forward only; compiled.
 
 The recursion of `smoothing.innovate`, operation by operation, for eight points at a time: what
-differences over many points (Gauss-Newton, Fisher matrices) and densities of many draws need. Noise
-is Gaussian, and outputs are measured through rows of their own. Only the look-up in tables goes
-point by point.
+differences over many points (Gauss-Newton, Fisher matrices) and densities of many draws need.
+Outputs are measured through rows of their own. Only the look-up in tables goes point by point.
 
 The numbers of a group of points are `Values` whose arrays are lanes, the last axis being the point:
 all but tables (WIDTH, E, grid), which are looked up point by point, and y, which the points share.
@@ -17,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from pyro_dynogp.lti.lanes import WIDTH, get, larger, put, root, splat
+from pyro_dynogp.lti.lanes import WIDTH, exponential, get, larger, put, root, splat
 from pyro_dynogp.moments.function_lanes import cubic, expand, locate
 from pyro_dynogp.moments.functions import TABLE
 from pyro_dynogp.moments.layout import FLOOR
@@ -225,8 +224,28 @@ def _append(i, time, layout, A, values, used, own):
 
 
 @njit(**WITHIN)
-def _measure(time, o, A, values, used, own, found):
-    """Use one output; its error and variance go to `found` (2 n n_y)."""
+def _mixture(r, p, R, layout):
+    """Density of a residual under noise of several Gaussians, as `noise.noise_terms`.
+
+    That is a product of exp(-r^2 / 2 S), S being the widest one's variance, and of `total`: both,
+    with E 1/S and E 1/S^2 by the components' weights.
+    """
+    square = splat(-0.5) * r * r
+    widest = splat(1.0) / (p + R * splat(layout.multiple[0]))
+    total = first = second = splat(0.0)
+    for k in range(layout.share.shape[0]):
+        inverse = splat(1.0) / (p + R * splat(layout.multiple[k]))
+        power = exponential(square * (inverse - widest))
+        weight = splat(layout.share[k]) * root(inverse) * power
+        total = total + weight
+        first = first + weight * inverse
+        second = second + weight * inverse * inverse
+    return square * widest, total, first / total, second / total
+
+
+@njit(**WITHIN)
+def _measure(time, o, layout, A, values, used, own, found):
+    """Use one output; what `innovate_lanes` writes goes to `found`."""
     y = values.y
     n, n_y = y.shape
     seen = used.H[o]
@@ -236,11 +255,20 @@ def _measure(time, o, A, values, used, own, found):
     p = _weighted(values.H, row, seen, own.c, 0, 1, A)
     mean = _weighted(values.H, row, seen, own.m, 0, 1, A)
     offset = get(values.y_offset, time * n_y + o)
-    variance = p + get(values.R, time * n_y + o)
+    R = get(values.R, time * n_y + o)
     put(found, time * n_y + o, splat(y[time, o]) - (mean + offset))
+    r = (splat(y[time, o]) - offset) - mean
+    variance = p + R
     put(found, (n + time) * n_y + o, variance)
-    beta = splat(1.0) / variance
-    alpha = ((splat(y[time, o]) - offset) - mean) * beta
+    if layout.share.shape[0] == 1:
+        beta = splat(1.0) / variance
+        alpha = r * beta
+    else:
+        power, total, first, second = _mixture(r, p, R, layout)
+        put(found, (2 * n + time) * n_y + o, power)
+        put(found, (3 * n + time) * n_y + o, total)
+        beta = first - r * r * (second - first * first)
+        alpha = r * first
     for i in range(A):
         c = get(own.c, i)
         put(own.m, i, get(own.m, i) + alpha * c)
@@ -254,7 +282,9 @@ def _measure(time, o, A, values, used, own, found):
 def innovate_lanes(layout, values, used, own, found):
     """Write innovations and their variances of one group to found (2, n, n_y, WIDTH).
 
-    Nothing is written where y is missing.
+    Under noise of several Gaussians, the widest first, found (4, ...) has the logarithm of a factor
+    of each density, too, and the other factor but for 1 / sqrt(2 pi). Nothing is written where y is
+    missing.
     """
     n, n_y = values.y.shape
     N = values.m0.shape[0]
@@ -275,4 +305,4 @@ def innovate_lanes(layout, values, used, own, found):
             _append(i, time, layout, A, values, used, own)
         for o in range(n_y):
             if not math.isnan(values.y[time, o]):
-                _measure(time, o, A, values, used, own, found)
+                _measure(time, o, layout, A, values, used, own, found)

@@ -17,17 +17,16 @@ _TABLES = ("table_mean", "table_variance")
 
 
 def lanes_serve(problem: FilterProblem) -> bool:
-    """Whether points go through in lanes: several, Gaussian noise, outputs of rows, one y."""
-    layout = problem.layout
-    gaussian = len(layout.share) == 1 and float(layout.multiple[0]) == 1.0
-    rows = gaussian and layout.measured < 0 and problem.y.dim() == 2
+    """Whether points go through in lanes: several, outputs of rows, one y."""
+    rows = problem.layout.measured < 0 and problem.y.dim() == 2
     return rows and problem.batch_shape.numel() >= FEWEST
 
 
-def innovate_together(problem: FilterProblem) -> tuple[np.ndarray, np.ndarray]:
-    """Innovations and their variances (*b, n, n_y) of all points, NaN where outputs are missing.
+def innovate_together(problem: FilterProblem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What `smoothing.innovate` has, each (*b, n, n_y), of all points; NaN where y is missing.
 
-    A point's numbers are those of `smoothing.innovate`, to the bit, whatever points are beside it.
+    A point's numbers are those of that, to the bit under Gaussian noise, whatever points are
+    beside it.
 
     Raises:
         AssertionError: where `lanes_serve` does not hold.
@@ -44,17 +43,24 @@ def innovate_together(problem: FilterProblem) -> tuple[np.ndarray, np.ndarray]:
     channels = int(layout.channels.max(initial=1))
     widest = int(layout.outputs.max(initial=1))
     N, E = parts["m0"].shape[-1], int(layout.f_start[-1])
+    gaussian = len(layout.share) == 1
 
     def group(g: int) -> np.ndarray:
         rows = np.minimum(np.arange(g * WIDTH, (g + 1) * WIDTH), count - 1)
         own = room(N, E, channels, widest, layout.nodes.shape[1])
-        found = np.full((2, *y.shape, WIDTH), np.nan)
+        found = np.full((2 if gaussian else 4, *y.shape, WIDTH), np.nan)
         innovate_lanes(layout, *_lanes(parts, rows, y), own, found)
         return np.moveaxis(found, -1, 0)[: count - g * WIDTH]
 
     found = np.concatenate(each(group, -(-count // WIDTH)))
+    error, variance = found[:, 0], found[:, 1]
+    if gaussian:
+        density = -0.5 * (error**2 / variance + np.log(2.0 * np.pi * variance))
+    else:
+        with np.errstate(divide="ignore"):  # where there is no density
+            density = found[:, 2] + np.log(found[:, 3]) - 0.5 * np.log(2.0 * np.pi)
     shape = (*batch, *y.shape)
-    return found[:, 0].reshape(shape), found[:, 1].reshape(shape)
+    return error.reshape(shape), variance.reshape(shape), density.reshape(shape)
 
 
 def _lanes(parts: dict[str, np.ndarray], rows: np.ndarray, y: np.ndarray) -> tuple[Values, InUse]:

@@ -42,6 +42,7 @@ MODELS = {
     "at the input": dgp.Hammerstein(1, pairs=1, inducing=8),
     "at the output": dgp.Wiener(1, pairs=1, inducing=12),
     "outliers": dgp.NonlinearFeedback(1, inducing=8, likelihood=dgp.StudentT()),
+    "limits": dgp.Cascade(1, (dgp.Dynamic(), dgp.Static(limits=(-2.0, 2.0), inducing=8))),
 }
 
 
@@ -126,7 +127,7 @@ def test_slope_and_curvature_are_those_of_the_likelihood(name):
     expected = here.z[here.places] - slopes[here.places]
     np.testing.assert_allclose(here.gradient, expected, rtol=1e-4, atol=1e-3 * abs(expected).max())
     assert np.linalg.eigvalsh(here.fisher.numpy()).min() > -1e-6 * float(here.fisher.abs().max())
-    if name == "outliers":  # not of a product of normals: the Hessian's part that curves downwards
+    if name == "limits":  # not of a product of normals: the Hessian's part that curves downwards
         H = here.potential.hessian_of(here.z, here.places.tolist()) - np.eye(len(here.places))
         values, axes = np.linalg.eigh(H)
         np.testing.assert_allclose(

@@ -1,7 +1,6 @@
 """Normals by the Fisher matrix of one-step predictions, and the evidence that they give."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pyro
@@ -18,21 +17,23 @@ from pyro_dynogp.inference.optimise.descent import WIDEST
 from pyro_dynogp.inference.optimise.gauss_newton import Innovations
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.plans import starting_points
+from tests.conftest import simulate_record
 from tests.inference.test_log_joint import GAPS
 
+LONG = simulate_record(dgp.Modes([-0.6 + 2.0j], [[0.8 + 0.3j]], [1.0], [[0.15]]), 1e-2, n=150)
 HAMMERSTEIN = dgp.Hammerstein(1, pairs=1, inducing=5)
 
 
-def begun(model):
+def begun(model, record=GAPS):
     """Potential of a model, and values near its start."""
-    problem = Problem.of(model, GAPS)
+    problem = Problem.of(model, record)
     (start,) = starting_points(problem.target, problem.records, Run(workers=1), count=1, steps=5)
     return Potential(problem.target, (problem.records,), start), start
 
 
-def of_values(model):
+def of_values(model, record=GAPS):
     """The potential of a function's values, all else fixed, and where they start."""
-    potential, start = begun(model)
+    potential, start = begun(model, record)
     fixed = {name: x for name, x in start.items() if name != "f_values"}
     free = {"f_values": torch.zeros_like(start["f_values"])}
     return Potential(potential.model, potential.args, free, fixed), free
@@ -55,18 +56,23 @@ def test_the_centre_is_where_values_are_without_steps():
     assert not fisher_normal(potential, start, steps=0)[0].any()
 
 
-def test_near_the_posterior_where_outputs_are_not_linear_in_them():
+@pytest.mark.parametrize("likelihood", [dgp.Gaussian(), dgp.StudentT(3.0)])
+def test_near_the_posterior_where_outputs_are_not_linear_in_them(likelihood):
     """Half the variance of the log ratios is the divergence, where it is small."""
-    potential, start = of_values(dgp.Wiener(1, pairs=1, inducing=5))
+    nu, y = likelihood.degrees_of_freedom, LONG.outputs
+    noise = np.random.default_rng(0).standard_t(nu or 1e6, y.shape)
+    record = LONG.with_outputs(y + 0.3 * np.nanstd(y) * noise)
+    model = dgp.Wiener(1, pairs=1, inducing=5, likelihood=likelihood)
+    potential, start = of_values(model, record)
     centre, root = (torch.as_tensor(x) for x in fisher_normal(potential, start))
     assert 0.5 * float(log_weights(potential, centre, root, 0).var()) < 0.5
     wider = log_weights(potential, centre, 2.0 * root, 0)
     assert 0.5 * float(wider.var()) > 1.0  # what it would be of another normal
 
 
-@pytest.mark.parametrize("likelihood", [dgp.StudentT(), None])
-def test_none_without_a_fisher_matrix(likelihood):
-    if likelihood is None:  # a user's own model
+@pytest.mark.parametrize("limited", [True, False])
+def test_none_without_a_fisher_matrix(limited):
+    if not limited:  # a user's own model
 
         def model(y):
             x = pyro.sample("x", dist.Normal(torch.tensor(0.0).double(), 1.0))
@@ -75,7 +81,8 @@ def test_none_without_a_fisher_matrix(likelihood):
         start = {"x": torch.tensor(0.3).double()}
         potential = Potential(model, (torch.tensor(1.0).double(),), start)
     else:
-        potential, start = begun(replace(HAMMERSTEIN, likelihood=likelihood))
+        function = dgp.Static(mean="linear", limits=(0.0, None), inducing=5)
+        potential, start = begun(dgp.Cascade(1, (dgp.Dynamic(pairs=1), function)))
     assert fisher_normal(potential, start) is None
     assert np.isfinite(log_evidence(potential, start))
 

@@ -12,6 +12,10 @@ from pyro_dynogp.moments.lane_passes import FEWEST, innovate_together, lanes_ser
 from pyro_dynogp.moments.problem import EVENTS, log_density
 from tests.moments.problems import LINE, WIDE, Block, random_problem
 
+STUDENT = {
+    "heavy tails": ([LINE], {"student": True}),
+    "heavy tails, two outputs": ([Block("rbf", 2, 2), LINE], {"student": True, "n_y": 2}),
+}
 TABLES = {
     "one table": ([LINE], {}),
     "two tables in a row": ([LINE, LINE], {"pairs": 3}),
@@ -39,18 +43,18 @@ def together(problems):
 
 def points(case, count):
     """Problems of one kind with numbers of their own."""
-    blocks, options = {**TABLES, **RADIAL}[case]
+    blocks, options = {**TABLES, **RADIAL, **STUDENT}[case]
     first = random_problem(blocks, **options)
     others = [random_problem(blocks, **options, seed=s) for s in range(1, count)]
     return [first, *(replace(one, layout=first.layout, y=first.y) for one in others)]
 
 
 def one_by_one(problems):
-    """Errors and variances (k, n, n_y) of each problem by itself."""
+    """Errors, variances and log-densities (k, n, n_y) of each problem by itself."""
     found = []
     for problem in problems:
         (values,), _ = problem.elements()
-        found.append(smoothing.innovate(problem.layout, values)[:2])
+        found.append(smoothing.innovate(problem.layout, values))
     return [np.stack(part) for part in zip(*found, strict=True)]
 
 
@@ -58,15 +62,16 @@ def one_by_one(problems):
 @pytest.mark.parametrize("case", TABLES)
 def test_tables_have_the_same_bits(case, count):
     problems = points(case, count)
-    for ours, alone in zip(
-        innovate_together(together(problems)), one_by_one(problems), strict=True
-    ):
-        assert np.isnan(alone).any()
-        np.testing.assert_array_equal(ours, alone)
+    *both, density = innovate_together(together(problems))
+    *alone, expected = one_by_one(problems)
+    for ours, theirs in zip(both, alone, strict=True):
+        assert np.isnan(theirs).any()
+        np.testing.assert_array_equal(ours, theirs)
+    np.testing.assert_allclose(density, expected, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("case", RADIAL)
-def test_radial_functions(case):
+@pytest.mark.parametrize("case", [*RADIAL, *STUDENT])
+def test_radial_functions_and_heavy_tails(case):
     """Exponentials have another last bit."""
     problems = points(case, 5)
     for ours, alone in zip(
@@ -83,9 +88,20 @@ def test_batches_of_several_dimensions_and_shared_numbers():
     own = {name: x.reshape(2, 3, *x.shape[1:]) for name, x in own.items()}
     shaped = replace(whole, **own, R=problems[0].R)
     alone = one_by_one([replace(one, R=problems[0].R) for one in problems])
-    for ours, expected in zip(innovate_together(shaped), alone, strict=True):
+    for ours, expected in zip(innovate_together(shaped)[:2], alone[:2], strict=True):
         assert ours.shape == (2, 3, *problems[0].y.shape)
         np.testing.assert_array_equal(ours.reshape(expected.shape), expected)
+
+
+def test_outliers_far_beyond_what_exponentials_hold():
+    """A residual of 1e6 standard deviations: the widest of the Gaussians has all the weight."""
+    problems = points("heavy tails", FEWEST)
+    y = problems[0].y.clone()
+    y[int(torch.argwhere(~y.isnan().any(1))[3])] += 1e6
+    problems = [replace(one, y=y) for one in problems]
+    density = innovate_together(together(problems))[2]
+    assert np.isfinite(density[:, ~y.isnan().any(1)]).all()
+    np.testing.assert_allclose(density, one_by_one(problems)[2], rtol=1e-11)
 
 
 def test_a_point_without_a_density_leaves_the_others_alone():
@@ -98,11 +114,11 @@ def test_a_point_without_a_density_leaves_the_others_alone():
         np.testing.assert_array_equal(before[[0, 2, 3]], after[[0, 2, 3]])
 
 
-def test_densities_are_those_of_the_filter():
-    """Normal log-densities of the innovations add up to the density of one point."""
-    problems = points("two outputs of a table, two of the record", 4)
-    error, variance = innovate_together(together(problems))
-    each = -0.5 * (error**2 / variance + np.log(2.0 * np.pi * variance))
+@pytest.mark.parametrize("case", ["two outputs of a table, two of the record", *STUDENT])
+def test_densities_are_those_of_the_filter(case):
+    """They add up to the density of one point."""
+    problems = points(case, 4)
+    each = innovate_together(together(problems))[2]
     expected = [float(log_density(one)) for one in problems]
     np.testing.assert_allclose(np.nansum(each, (1, 2)), expected, rtol=1e-12)
 
@@ -113,7 +129,7 @@ def test_what_goes_through_in_lanes():
     assert not lanes_serve(together(problems[:-1]))
     own = replace(together(problems), y=torch.stack([one.y for one in problems]))
     assert not lanes_serve(own)
-    for options in ({"student": True}, {"measured": True}):
-        kind = [random_problem([LINE], **options, seed=s) for s in range(FEWEST)]
-        kind = [replace(one, layout=kind[0].layout, y=kind[0].y) for one in kind]
-        assert not lanes_serve(together(kind))
+    assert lanes_serve(together(points("heavy tails", FEWEST)))
+    kind = [random_problem([LINE], measured=True, seed=s) for s in range(FEWEST)]
+    kind = [replace(one, layout=kind[0].layout, y=kind[0].y) for one in kind]
+    assert not lanes_serve(together(kind))

@@ -104,9 +104,9 @@ class Mode:
     whose static layers see process noise, see `optimizer_for`.
 
     Attributes:
-        optimizer: "gauss-newton" (under Gaussian noise), "lbfgs", "preconditioned" (L-BFGS in
-            coordinates that Hessians make round, which gets to the top of long ridges) or "adam";
-            None for what suits the model, see `optimizer_for`.
+        optimizer: "gauss-newton" (of models whose last layer has no limits), "lbfgs",
+            "preconditioned" (L-BFGS in coordinates that Hessians make round, which gets to the top
+            of long ridges) or "adam"; None for what suits the model, see `optimizer_for`.
 
     Raises:
         ValueError: on an unknown optimizer.

@@ -1,15 +1,17 @@
 r"""Gauss-Newton climbs of a model's posterior, from one-step predictions alone.
 
-Outputs under Gaussian noise have the densities of their innovations e_i, the errors of one-step
-predictions, with variances d_i. Where only the last layer's trajectory is unknown these are normal;
-else a rest r_i is added to each normal log-density. The energy, its gradient and the Fisher matrix
+Outputs have the densities of their innovations e_i, the errors of one-step predictions, with
+variances d_i. Under Gaussian noise these are normal, unless the last layer is a function; else a
+rest r_i is added to each normal log-density. The energy, its gradient and the Fisher matrix
 (without the rest) are
 
     E = E_prior + sum_i (e_i^2 / d_i + log 2 pi d_i) / 2 - r_i,
     g = g_prior + sum_i e_i e_i' / d_i + (1 - e_i^2 / d_i) l_i' / 2 - r_i',     l_i = log d_i,
-    F = sum_i e_i' e_i'^T / d_i + l_i' l_i'^T / 2,
+    F = sum_i a e_i' e_i'^T / d_i + b l_i' l_i'^T / 2,
 
-primes being derivatives by the unconstrained vector (Fahrmeir & Tutz 2001, section 8.2). These are
+primes being derivatives by the unconstrained vector (Fahrmeir & Tutz 2001, section 8.2). Under
+Student-t noise of nu degrees of freedom, d_i being squares of its scale, a = (nu + 1) / (nu + 3)
+and b = nu / (nu + 3) (Lange, Little & Taylor, JASA 84:881, 1989), else both are 1. Derivatives are
 differences over d + 1 points that go through the filter together, forward only; the prior has its
 own curvature. Each iteration tries several dampings of the step, again together, straight and bent
 along the valleys that systems with spare pairs have: half the second derivative of e and log d
@@ -29,6 +31,7 @@ from torch import Tensor
 
 from pyro_dynogp.inference.log_joint import Direct
 from pyro_dynogp.inference.optimise.lengths import Lengths
+from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.wiring import Static
@@ -59,12 +62,20 @@ DONE = "nothing left to gain"
 
 
 def has_innovations(model: object) -> bool:
-    """Whether a model, once collapsed, is a product of predictions under Gaussian noise."""
+    """Whether a model, once collapsed, is a product of predictions that are nearly normal."""
     if not isinstance(model, Model):
         return False
     last = model.layers[-1]
-    limited = isinstance(last, Static) and last.limits is not None
-    return model.likelihood.gaussian and not limited
+    return not (isinstance(last, Static) and last.limits is not None)
+
+
+def information(likelihood: Likelihood) -> tuple[float, float]:
+    """Shares a and b of the information that Gaussian noise of the same scale would leave.
+
+    Of an output's mean, and of the logarithm of its variance; those of the noise alone.
+    """
+    nu = likelihood.degrees_of_freedom
+    return (1.0, 1.0) if nu is None else ((nu + 1.0) / (nu + 3.0), nu / (nu + 3.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +85,7 @@ class Local:
     Attributes:
         energy: -log p(y, values). gradient: (d,). fisher: (d, d), of the outputs.
         prior: (d, d), curvature of the prior.
-        level: (2, N) errors over their sd, and log variances over sqrt(2). sd: (N,).
+        level: (2, N) sqrt(a) errors over their sd, and sqrt(b / 2) log variances. sd: (N,).
         slopes: (2, d, N) their derivatives.
     """
 
@@ -113,6 +124,7 @@ class Innovations:
         self.jacobian = jacobian
         # Lengths are for climbs of the values' density alone.
         self._linear, self._lengths = potential.linear, Lengths([] if jacobian else potential.sites)
+        self._of_mean, self._of_variance = information(self.density.model.likelihood)
         self._there = [~torch.isnan(y) for y in self.density.observations]
         model = self.density.model
         states = sum(2 * layer.modes for _, layer in model.dynamic)
@@ -139,10 +151,13 @@ class Innovations:
         prior, gradients = self._prior(points)
         with np.errstate(all="ignore"):
             sd = np.sqrt(variances[0])
-            level = np.stack([errors / sd, np.log(variances) * math.sqrt(0.5)])
+            level = self._level(errors, variances, sd)
             slopes = (level[:, 1:] - level[:, :1]) / STEP
             first = level[:, 0]
-            weights = np.stack([first[0], math.sqrt(0.5) * (1.0 - first[0] ** 2)])
+            of_variance = math.sqrt(0.5 / self._of_variance)
+            weights = np.stack([
+                first[0] / self._of_mean, of_variance * (1.0 - first[0] ** 2 / self._of_mean)
+            ])  # fmt: skip
             gradients = gradients[:, self.free]
             gradient = gradients[0] + sum(J @ w for J, w in zip(slopes, weights, strict=True))
             gradient -= (rest[1:] - rest[0]).sum(1) / STEP
@@ -158,13 +173,18 @@ class Innovations:
         """Second derivatives along moves (k, d) from z (d,), projected on the slopes (k, free)."""
         errors, variances, _ = self._innovations(z + ALONG * moves)
         with np.errstate(all="ignore"):
-            level = np.stack([errors / here.sd, np.log(variances) * math.sqrt(0.5)])
+            level = self._level(errors, variances, here.sd)
             change = (level - here.level[:, None]) / ALONG
         parts = [
             (2.0 / ALONG) * ((c - moves[:, self.free] @ J) @ J.T)
             for c, J in zip(change, here.slopes, strict=True)
         ]
         return np.nan_to_num(sum(parts), posinf=0.0, neginf=0.0)
+
+    def _level(self, errors: np.ndarray, variances: np.ndarray, sd: np.ndarray) -> np.ndarray:
+        """As of `Local`, at k points (2, k, N)."""
+        mean, variance = math.sqrt(self._of_mean), math.sqrt(0.5 * self._of_variance)
+        return np.stack([mean * errors / sd, np.log(variances) * variance])
 
     def _prior(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Energies (k,) of the prior at z (k, d), and their gradients (k, d)."""

@@ -295,7 +295,7 @@ def _stages(
 
 
 def optimizer_for(model: Model) -> Optimizer:
-    """The optimizer of a first fit: Gauss-Newton under Gaussian noise, else L-BFGS, or Adam.
+    """The optimizer of a first fit: Gauss-Newton where the model has innovations, or Adam.
 
     Where static layers see process noise the highest modes explain with it what dynamics and
     functions should, and free runs are poor: on the measured circuit (8192 samples) the mode by
@@ -309,5 +309,5 @@ def optimizer_for(model: Model) -> Optimizer:
 
 
 def optimizer_near(model: Model) -> Optimizer:
-    """The optimizer that goes on from near an optimum: Gauss-Newton under Gaussian noise."""
+    """The optimizer that goes on from near an optimum: Gauss-Newton where it can."""
     return "gauss-newton" if has_innovations(model) else "preconditioned"
