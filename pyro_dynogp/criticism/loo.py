@@ -73,8 +73,8 @@ def loo(
     Returns:
         ELPDData with ArviZ's entries (elpd_loo, se, p_loo, pareto_k, loo_i, ...) and: `target`,
         `horizon`, `data` (fingerprint), `draws_from`, `drawn` (the parameters whose uncertainty
-        is counted; ``print`` says it, too), `posterior_k` (Pareto's k of the posterior
-        itself), `corrected` (whether ratios p/q enter: not where posterior_k is too high),
+        is counted; ``print`` says it, too), `posterior_k` (Pareto's k of the draws
+        themselves), `corrected` (whether ratios p/q enter: not where posterior_k is too high),
         `monte_carlo_error` of elpd_loo [nats], `refits`, `not_refitted`, `notes`. `loo_i` has the
         coordinates record, sample and output. `se` takes samples as independent: `compare` has
         standard errors that do not.

@@ -12,9 +12,10 @@ import numpy as np
 import torch
 
 from pyro_dynogp.criticism.densities import Kind, pointwise_log_density
-from pyro_dynogp.criticism.posterior_draws import carried, draws_of
+from pyro_dynogp.criticism.posterior_draws import carried, draws_of, wider_draws
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.log_joint import AT_ONCE
+from pyro_dynogp.inference.pareto import good_k, psis
 from pyro_dynogp.inference.posterior_draws import PosteriorDraws, Values
 from pyro_dynogp.inference.refit import refit
 from pyro_dynogp.models.output_process import OutputProcess
@@ -76,12 +77,19 @@ class FitSubject:
 
     @cached_property
     def draws(self) -> PosteriorDraws:
-        """Draws (S) of the posterior, or the mode as the only one."""
+        """Draws (S) of the posterior, or the mode as the only one.
+
+        Of normals around optima somewhat wider ones, whose ratios have lighter tails when data are
+        left out; their own where those do not describe the posterior.
+        """
         if self.drawn is not None:
             return self.drawn
         if self.parameters == "mode":
             values = {name: value.unsqueeze(0) for name, value in self.fit.mode.items()}
             return PosteriorDraws(values, None, None, np.zeros(1, dtype=int), "at the mode")
+        wider = wider_draws(self.fit, self.count, self.seed)
+        if wider is not None and psis(wider.log_ratio)[1] <= good_k(self.count):
+            return wider
         return draws_of(self.fit, count=self.count, seed=self.seed, progress=self.progress)
 
     @cached_property

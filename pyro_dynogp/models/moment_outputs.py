@@ -68,7 +68,9 @@ class MomentOutputs(OutputProcess):
 
     def _pass(self, y: Tensor, compiled: Pass) -> tuple[Tensor, Tensor, Tensor]:
         """Results (*b, n, n_y) of a pass for each element of the batch, scaled."""
-        problem = self._problem(y)
+        return self._pass_of(self._problem(y), compiled)
+
+    def _pass_of(self, problem: FilterProblem, compiled: Pass) -> tuple[Tensor, Tensor, Tensor]:
         elements, batch = problem.elements()
         found = each(lambda b: np.stack(compiled(problem.layout, elements[b])), len(elements))
         stacked = torch.from_numpy(np.stack(found))
@@ -94,18 +96,22 @@ class MomentOutputs(OutputProcess):
     def _innovate(self, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Scaled innovations (*b, n, n_y), variances, and what log-densities have beyond normal."""
         problem = self._problem(y)
-        if lanes_serve(problem):
-            found = (torch.from_numpy(x) for x in innovate_together(problem))
-            error, variance, density = (x[..., :: self.system.substeps, :] for x in found)
-            if self.system.noise.likelihood.gaussian:
-                return error, variance, torch.zeros_like(error)
-        else:
-            error, variance, density = self._pass(y, smoothing.innovate)
+        error, variance, density = self._innovations_of(problem)
+        if lanes_serve(problem) and self.system.noise.likelihood.gaussian:
+            return error, variance, torch.zeros_like(error)
         return error, variance, density - _normal_density(error, variance)
+
+    def _innovations_of(self, problem: FilterProblem) -> tuple[Tensor, Tensor, Tensor]:
+        """What `smoothing.innovate` has (*b, n, n_y) at each sample."""
+        if not lanes_serve(problem):
+            return self._pass_of(problem, smoothing.innovate)
+        found = (torch.from_numpy(x) for x in innovate_together(problem))
+        error, variance, density = (x[..., :: self.system.substeps, :] for x in found)
+        return error, variance, density
 
     def one_step(self, y: Tensor) -> Moments:
         """See `OutputProcess`."""
-        error, variance, density = self._pass(y, smoothing.innovate)
+        error, variance, density = self._innovations_of(self._problem(y))
         return self._moments(self.scaled(y) - error, variance, density)
 
     def ahead(self, y: Tensor, horizon: int) -> Moments:
