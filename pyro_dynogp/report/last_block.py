@@ -137,14 +137,10 @@ class Compared:
     error: float
     settings: LoopSettings
 
-    def _all(self, ratio: Callable[[float, float], bool]) -> bool:
-        """Whether something holds of both scores, after and before."""
-        return all(ratio(self.after[name], self.before[name]) for name in ("rmse", "crps"))
-
     @property
     def better(self) -> bool:
         """Whether forecasts are better by both scores."""
-        return self._all(lambda after, before: after < before)
+        return self._ratios[1] < 1.0
 
     @property
     def less_likely(self) -> bool:
@@ -155,13 +151,23 @@ class Compared:
     def does_harm(self) -> bool:
         """Whether what was added makes the model do worse on the last block.
 
-        It does where the RMSE and the CRPS of its forecasts are more than `settings.worse` times
-        those before, or where it loses more log density than `settings.worse_errors` standard
-        errors and does not forecast better by both scores: densities one step ahead fall, too,
-        where process noise has gone that made up for what was missing.
+        It does where the RMSE or the CRPS of its forecasts is more than `settings.worse` times that
+        before and the other is not better by as much, or where it loses more log density than
+        `settings.worse_errors` standard errors and does not forecast better by both scores:
+        densities one step ahead fall, too, where process noise has gone that made up for what was
+        missing.
         """
-        worse = self._all(lambda after, before: after > self.settings.worse * before)
+        least, most = self._ratios
+        worse = most > self.settings.worse and least * self.settings.worse > 1.0
         return worse or (self.less_likely and not self.better)
+
+    @property
+    def _ratios(self) -> tuple[float, float]:
+        """Scores after over those before, the smaller one first."""
+        tiny = float(np.finfo(float).tiny)  # a score may be zero
+        names = "rmse", "crps"
+        least, most = sorted((self.after[k] + tiny) / (self.before[k] + tiny) for k in names)
+        return least, most
 
     @property
     def _change(self) -> str:
@@ -204,15 +210,34 @@ class Compared:
 
     @property
     def disagreement(self) -> list[str]:
-        """In words, that scores disagree: better forecasts, lower densities one step ahead."""
-        if not (self.less_likely and self.better):
-            return []
-        return [
-            f"Scores of the last block disagree: forecasts are better with what was added, one "
-            f"step ahead the model before is more likely (elpd {self.gain:+.1f} +- "
-            f"{self.error:.1f} nats). Take the extended model (report.fit) for simulation and "
-            f"forecasts; one step ahead report.base."
-        ]
+        """In words, that scores disagree, and which of them to go by."""
+        found = []
+        least, most = self._ratios
+        if most > self.settings.worse and least * self.settings.worse <= 1.0:
+            found.append(f"Scores of the last block disagree ({self._change}): {self._apart}")
+        if self.less_likely and self.better:
+            found.append(
+                f"Scores of the last block disagree: forecasts are better with what was added, one "
+                f"step ahead the model before is more likely (elpd {self.gain:+.1f} +- "
+                f"{self.error:.1f} nats). Take the extended model (report.fit) for simulation and "
+                f"forecasts; one step ahead report.base."
+            )
+        return found
+
+    @property
+    def _apart(self) -> str:
+        """In words, what it means that the RMSE is better and the CRPS worse, or the reverse."""
+        if self.after["rmse"] < self.before["rmse"]:
+            return (
+                "with what was added the largest errors are smaller, but forecasts with their "
+                "bands are worse. Take the extended model (report.fit) for its means alone; for "
+                "bands report.base."
+            )
+        return (
+            "with what was added most forecasts and their bands are better, but the largest errors "
+            "are larger. Take the extended model (report.fit), unless large errors cost most: then "
+            "report.base."
+        )
 
 
 def _outcome(course: SearchState, left: Sequence[str], *, harm: bool) -> str:

@@ -45,9 +45,9 @@ class LoopSettings:
         gate: share of `level` for each of the two answers to whether anything is left.
             Evidence: two tests, Bonferroni.
         worse: ratio of errors after to before from which effects do harm: on the last block (by
-            RMSE and CRPS), so that the report keeps the model before; and of a line in time to
-            the last level held (by RMSE), beyond which it is not added.
-            Evidence: reason: effects of the noise change scores by chance.
+            RMSE or CRPS, the other not better by as much), so that the report keeps the model
+            before; and of a line in time to the last level held (by RMSE), beyond which it is not
+            added. Evidence: reason: effects of the noise change scores by chance.
         worse_errors: standard errors of a loss of log density on the last block from which effects
             do harm. Evidence: convention.
         level_samples: over which the last level is averaged that a drift is held at.

@@ -32,6 +32,9 @@ BEFORE = {"rmse": 1.0, "crps": 0.5}
         ({"rmse": 1.06, "crps": 0.53}, 20.0, True),
         ({"rmse": 1.3, "crps": 0.4}, 20.0, False),  # one of the scores is better
         ({"rmse": 0.9, "crps": 0.7}, 20.0, False),
+        ({"rmse": 0.97, "crps": 0.57}, 20.0, True),  # by less than the other one is worse
+        ({"rmse": 1.06, "crps": 0.49}, 20.0, True),
+        ({"rmse": 1.06, "crps": 0.47}, 20.0, False),
         ({"rmse": 1.3, "crps": 0.7}, 20.0, True),
     ],
 )
@@ -59,6 +62,23 @@ def test_scores_that_disagree_are_said(after: dict[str, float], gain: float, sai
     found = Compared(BEFORE, after, gain, 3.0, LoopSettings()).disagreement
     assert bool(found) is said
     assert not said or "one step ahead report.base" in found[0]
+
+
+@pytest.mark.parametrize(
+    ("after", "said"),
+    [
+        ({"rmse": 0.9, "crps": 0.7}, "for bands report.base"),
+        ({"rmse": 1.3, "crps": 0.4}, "unless large errors cost most"),
+        ({"rmse": 0.97, "crps": 0.57}, ""),  # that is harm
+        ({"rmse": 0.9, "crps": 0.52}, ""),
+        ({"rmse": 0.5, "crps": 0.25}, ""),
+    ],
+)
+def test_rmse_and_crps_that_disagree_are_said(after: dict[str, float], said: str) -> None:
+    found = Compared(BEFORE, after, 20.0, 3.0, LoopSettings()).disagreement
+    assert len(found) == bool(said)
+    assert not said or said in found[0]
+    assert not said or f"RMSE 1 -> {after['rmse']}" in found[0]
 
 
 def test_two_models_that_are_the_same_do_no_harm() -> None:
