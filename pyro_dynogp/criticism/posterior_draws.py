@@ -152,7 +152,7 @@ def normal_near(fit: Fitted, share: float = 1.0) -> Mixture:
 
     A Hessian of a model with static functions takes hundreds of gradients, and the climb to the
     mode that Laplace's approximation is around as many; the Fisher matrix takes a few. Without one
-    (other noise than Gaussian, a mode at an edge) it is Laplace's approximation.
+    (a last layer with limits, a mode at an edge) it is Laplace's approximation.
 
     Args:
         fit: a posterior mode. share: of the posterior's standard deviations.

@@ -104,7 +104,10 @@ class Likelihood:
         return StaticPrior("log_noise", channels, outputs, self.inducing)
 
     def components(self) -> tuple[np.ndarray, np.ndarray]:
-        """Shares and variance multiples (K,) of the Gaussian mixture: one component if Gaussian."""
+        """Shares and variance multiples (K,) of the Gaussian mixture, the widest first.
+
+        One component if Gaussian.
+        """
         if self.degrees_of_freedom is None:
             return np.ones(1), np.ones(1)
         return student_components(self.degrees_of_freedom)

@@ -23,7 +23,8 @@ class Layout(NamedTuple):
         form: (S,) TABLE or a radial kernel.
         g_start, f_start: (S + 1,) where the layer's inputs and outputs start among all.
         nodes: (S, Q, d_max), node_weight: (S, Q), node_count: (S,).
-        share, multiple: (K,) weights and variance multiples of the noise's Gaussian components.
+        share, multiple: (K,) weights and variance multiples of the noise's Gaussian components,
+            the widest first.
         measured: static layer, the last one, whose only output is the record's, a function of one
             signal (see `measured_function`); -1 where there is none.
     """

@@ -210,7 +210,9 @@ class Compared:
 
     @property
     def disagreement(self) -> list[str]:
-        """In words, that scores disagree, and which of them to go by."""
+        """In words, that scores disagree and which to go by; nothing where that is harm."""
+        if self.does_harm:
+            return []
         found = []
         least, most = self._ratios
         if most > self.settings.worse and least * self.settings.worse <= 1.0:

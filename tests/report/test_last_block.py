@@ -81,6 +81,13 @@ def test_rmse_and_crps_that_disagree_are_said(after: dict[str, float], said: str
     assert not said or f"RMSE 1 -> {after['rmse']}" in found[0]
 
 
+def test_a_fit_that_is_not_kept_is_not_advised() -> None:
+    """Density is lost for certain while RMSE and CRPS disagree: the model before is kept."""
+    found = Compared(BEFORE, {"rmse": 0.9, "crps": 0.7}, -20.0, 3.0, LoopSettings())
+    assert found.does_harm
+    assert not found.disagreement
+
+
 def test_two_models_that_are_the_same_do_no_harm() -> None:
     assert not Compared(BEFORE, BEFORE, 0.0, 0.0, LoopSettings()).does_harm
 
