@@ -58,7 +58,9 @@ class MomentOutputs(OutputProcess):
         """Log-density (*s, *batch) of outputs (*s, *batch, *event) [nats]."""
         problem = self._problem(value)
         if lanes_serve(problem) and not problem.wants_gradient:
-            total = torch.from_numpy(innovate_together(problem)[2]).nansum((-2, -1))
+            density = torch.from_numpy(innovate_together(problem)[2])
+            # What is missing counts nothing; a point that breaks has no density.
+            total = density.masked_fill(torch.isnan(problem.y), 0.0).sum((-2, -1))
         else:
             total = log_density(problem)
         there = (~torch.isnan(self.columns(value))).to(torch.float64)
@@ -66,11 +68,8 @@ class MomentOutputs(OutputProcess):
         lead = value.shape[: value.dim() - len(self.event_shape)]
         return (total - jacobian).expand(broadcast(lead, self.batch_shape))
 
-    def _pass(self, y: Tensor, compiled: Pass) -> tuple[Tensor, Tensor, Tensor]:
+    def _pass(self, problem: FilterProblem, compiled: Pass) -> tuple[Tensor, Tensor, Tensor]:
         """Results (*b, n, n_y) of a pass for each element of the batch, scaled."""
-        return self._pass_of(self._problem(y), compiled)
-
-    def _pass_of(self, problem: FilterProblem, compiled: Pass) -> tuple[Tensor, Tensor, Tensor]:
         elements, batch = problem.elements()
         found = each(lambda b: np.stack(compiled(problem.layout, elements[b])), len(elements))
         stacked = torch.from_numpy(np.stack(found))
@@ -104,7 +103,7 @@ class MomentOutputs(OutputProcess):
     def _innovations_of(self, problem: FilterProblem) -> tuple[Tensor, Tensor, Tensor]:
         """What `smoothing.innovate` has (*b, n, n_y) at each sample."""
         if not lanes_serve(problem):
-            return self._pass_of(problem, smoothing.innovate)
+            return self._pass(problem, smoothing.innovate)
         found = (torch.from_numpy(x) for x in innovate_together(problem))
         error, variance, density = (x[..., :: self.system.substeps, :] for x in found)
         return error, variance, density
@@ -117,8 +116,9 @@ class MomentOutputs(OutputProcess):
     def ahead(self, y: Tensor, horizon: int) -> Moments:
         """See `OutputProcess`."""
         steps = horizon * self.system.substeps
+        problem = self._problem(y)
         return self._moments(
-            *self._pass(y, lambda layout, v: smoothing.predict_ahead(layout, v, steps))
+            *self._pass(problem, lambda layout, v: smoothing.predict_ahead(layout, v, steps))
         )
 
     def left_out(self, y: Tensor) -> Moments:
@@ -129,7 +129,7 @@ class MomentOutputs(OutputProcess):
             mean, variance, density = smoothing.leave_one_out(layout, v, track)
             return mean, variance, density
 
-        return self._moments(*self._pass(y, compiled))
+        return self._moments(*self._pass(self._problem(y), compiled))
 
     def prediction_errors(self, y: Tensor, horizon: int, count: int) -> None:
         """None: errors are drawn independently of each other."""

@@ -214,8 +214,7 @@ class Compared:
         if self.does_harm:
             return []
         found = []
-        least, most = self._ratios
-        if most > self.settings.worse and least * self.settings.worse <= 1.0:
+        if self._ratios[1] > self.settings.worse:
             found.append(f"Scores of the last block disagree ({self._change}): {self._apart}")
         if self.less_likely and self.better:
             found.append(

@@ -6,10 +6,16 @@ import numpy as np
 import pytest
 import torch
 
+import pyro_dynogp as dgp
+from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.methods.base import Problem
+from pyro_dynogp.inference.run import Run
+from pyro_dynogp.inference.starts.plans import starting_points
 from pyro_dynogp.lti.lanes import WIDTH
 from pyro_dynogp.moments import smoothing
 from pyro_dynogp.moments.lane_passes import FEWEST, innovate_together, lanes_serve
 from pyro_dynogp.moments.problem import EVENTS, log_density
+from tests.inference.test_log_joint import GAPS
 from tests.moments.problems import LINE, WIDE, Block, random_problem
 
 STUDENT = {
@@ -67,6 +73,7 @@ def test_tables_have_the_same_bits(case, count):
     for ours, theirs in zip(both, alone, strict=True):
         assert np.isnan(theirs).any()
         np.testing.assert_array_equal(ours, theirs)
+    # Logarithms are numpy's in lanes and the compiler's at one point.
     np.testing.assert_allclose(density, expected, rtol=1e-12, atol=1e-12)
 
 
@@ -101,6 +108,7 @@ def test_outliers_far_beyond_what_exponentials_hold():
     problems = [replace(one, y=y) for one in problems]
     density = innovate_together(together(problems))[2]
     assert np.isfinite(density[:, ~y.isnan().any(1)]).all()
+    # Exponentials have another last bit, as above.
     np.testing.assert_allclose(density, one_by_one(problems)[2], rtol=1e-11)
 
 
@@ -112,6 +120,22 @@ def test_a_point_without_a_density_leaves_the_others_alone():
     assert np.isnan(found[1][1]).all()
     for before, after in zip(clean, found, strict=True):
         np.testing.assert_array_equal(before[[0, 2, 3]], after[[0, 2, 3]])
+
+
+@pytest.mark.parametrize("likelihood", [dgp.Gaussian(), dgp.StudentT(3.0)])
+def test_a_point_that_breaks_has_no_density_beside_others(likelihood):
+    """Not that of the samples before it breaks; missing samples count nothing."""
+    problem = Problem.of(dgp.NonlinearFeedback(1, inducing=8, likelihood=likelihood), GAPS)
+    (start,) = starting_points(problem.target, problem.records, Run(workers=1), count=1, steps=3)
+    density = Potential(problem.target, (problem.records,), start).log_density
+    several = {name: x.expand(FEWEST, *x.shape).clone() for name, x in start.items()}
+    y = density.observations[0]
+    whole = density.outputs(several)[0].log_prob(y)
+    several["g_initial_state"][1] = torch.inf
+    broken = density.outputs(several)[0].log_prob(y)
+    assert torch.isfinite(whole).all()
+    assert not torch.isfinite(broken[1])
+    assert torch.equal(broken[[0, 2]], whole[[0, 2]])
 
 
 @pytest.mark.parametrize("case", ["two outputs of a table, two of the record", *STUDENT])
