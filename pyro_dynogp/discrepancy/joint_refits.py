@@ -10,7 +10,7 @@ from pyro_dynogp.discrepancy.held_out import certain
 from pyro_dynogp.discrepancy.judged import SPREAD, Judged, Kind, judge
 from pyro_dynogp.discrepancy.refits import Refits
 from pyro_dynogp.discrepancy.search import extended_by
-from pyro_dynogp.models.variants import Model
+from pyro_dynogp.models.variants import Model, with_channels_of
 
 # Effects of which pairs are tried.
 MOST = 3
@@ -18,10 +18,17 @@ MOST = 3
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two effects, variants of the model with both, and where these are scored."""
+    """Two effects, variants of the model with both, and where these are scored.
+
+    Attributes:
+        models: with the second added to what was kept of the first. complete: whether the second is
+            there as it was kept, too, so that its numbers (delays, limits) are not looked for once
+            more: next to functions each variant takes as long as a refit.
+    """
 
     members: tuple[Judged, Judged]
     models: tuple[Model, ...]
+    complete: bool
 
     @property
     def kind(self) -> Kind:
@@ -45,7 +52,10 @@ def confirmed_together(refits: Refits, judged: Sequence[Judged], level: float) -
     pairs = _pairs(refits, judged, level)
     together = refits.run(
         {
-            k: refits.trial(one.models, one.kind, one.members[1].found)
+            k: refits.trial(
+                one.models, one.kind, None if one.complete else one.members[1].found,
+                base=one.members[0].tried.fit if one.complete else None,
+            )
             for k, one in enumerate(pairs)
         },
         "joint refits",
@@ -84,14 +94,22 @@ def _pairs(refits: Refits, judged: Sequence[Judged], level: float) -> list[Pair]
         if one.found.q_value <= level and one.kind[1] == "forecast" and not one.tried.failure
     ]  # fmt: skip
     sure = sorted(sure, key=lambda one: -one.attempt.gain)[:MOST]
-    pairs = []
-    for one, other in itertools.combinations(sure, 2):
-        for first, second in ((one, other), (other, one)):
-            models, _ = extended_by(second.found, first.tried.model, refits.record)
-            if models:
-                pairs.append(Pair((first, second), tuple(models)))
-                break
-    return pairs
+    both = [_pair(refits, one, other) for one, other in itertools.combinations(sure, 2)]
+    return [pair for pair in both if pair is not None]
+
+
+def _pair(refits: Refits, one: Judged, other: Judged) -> Pair | None:
+    """One effect added to the model with the other one; None where neither can be."""
+    orders = ((one, other), (other, one))
+    for first, second in orders:
+        together = with_channels_of(first.tried.model, second.tried.model, refits.model)
+        if together is not None:
+            return Pair((first, second), (together,), complete=True)
+    for first, second in orders:
+        models, _ = extended_by(second.found, first.tried.model, refits.record)
+        if models:
+            return Pair((first, second), tuple(models), complete=False)
+    return None
 
 
 def _together_with(second: Judged, first: Judged, both: Judged) -> Judged:

@@ -50,15 +50,25 @@ class Refits:
         """The model that is extended."""
         return replace(self.current.model, scaling=None)
 
-    def trial(self, models: tuple[Model, ...], kind: Kind, found: Found | None) -> Trial:
-        """Of variants of an effect, or of the model itself."""
+    def trial(
+        self,
+        models: tuple[Model, ...],
+        kind: Kind,
+        found: Found | None,
+        base: Fit | None = None,
+    ) -> Trial:
+        """Of variants of an effect; without one of the model itself, or of one that extends a fit.
+
+        Args:
+            models: the variants. kind: how they are scored. found: the effect, None for none.
+            base: the fit to start from; None for that of the model itself.
+        """
         where, score = kind
-        known = self.current if found is None and where == "after" else None
+        known = self.current if found is None and base is None and where == "after" else None
         spread = interleaved(len(self.record), self.settings.folds)
         folds = spread if where == "spread" else (self.held_out,)
-        plain = Trial(
-            models, self.record, folds, self.current, self.seed, self.settings, score, fit=known
-        )
+        start = self.current if base is None else base
+        plain = Trial(models, self.record, folds, start, self.seed, self.settings, score, fit=known)
         if found is None:
             return plain
         return replace(plain, refine=found.effect.refine, compared=found.effect.compared)

@@ -240,7 +240,8 @@ def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     place of what is learnt.
 
     Process noise that has explained what the smaller model lacks keeps the larger one from
-    explaining it: one climb goes without any first, and takes that of a fresh start then.
+    explaining it: one climb goes without any first, and takes that of a fresh start then. Not where
+    variants are compared, of which the order is the same.
     """
     target, records = problem.target, problem.records
     starts, new = extended_starts(fit, problem.model, records, run.seed)
@@ -267,7 +268,7 @@ def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
         return climb(target, records, starts, [], run, optimizer=optimizer, effort=effort,
                      steps=run.steps or ADDED_STEPS[optimizer])  # fmt: skip
     if run.steps:  # a few, to compare variants
-        starts = [most_probable(problem, starts)]
+        return climbed(target, [most_probable(problem, starts)], run.steps)
     if have_same_parameters(target, fit.model):  # nothing is new
         return climbed(target, starts[:1], LAYERED_STEPS)
     quiet = without_noise_below_functions(target)

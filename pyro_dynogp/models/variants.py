@@ -51,6 +51,22 @@ def without_channel(model: Model, channel: Channel) -> Model:
     )
 
 
+def with_channels_of(model: Model, other: Model, base: Model) -> Model | None:
+    """The model with the channels that another one adds to a base.
+
+    None where that one adds none or differs in more than them, and where the model has others than
+    the base: what they replace has another name.
+    """
+    if model.channels != base.channels:
+        return None
+    own = len(base.channels)
+    added, same = other.channels[own:], base
+    for channel in added:
+        same = with_channel(same, channel)
+        model = with_channel(model, channel)
+    return model if added and same == other else None
+
+
 def with_dynamics(model: Model, change: Callable[[Wire, Dynamic], Dynamic]) -> Model:
     """The model with other dynamic layers."""
     layers = tuple(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -10,12 +10,14 @@ import pytest
 
 import pyro_dynogp as dgp
 from pyro_dynogp import effects
+from pyro_dynogp.data.channels import DeadZone
 from pyro_dynogp.discrepancy import joint_refits
 from pyro_dynogp.discrepancy.joint_refits import confirmed_together
 from pyro_dynogp.discrepancy.judged import Judged, judge, kind_of
 from pyro_dynogp.discrepancy.refits import Refits
 from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.discrepancy.trials import Tried
+from pyro_dynogp.models.variants import with_channel, with_feedback
 from pyro_dynogp.statistics.evidence import Evidence
 from tests.discrepancy.made import SETTINGS
 
@@ -50,7 +52,8 @@ class Trials:
                  ("forecast", "one step")]  # fmt: skip
         self.results = {("", kind): nothing for kind in kinds}
 
-    def trial(self, models: Any, kind: Any, found: Found | None) -> Any:
+    def trial(self, models: Any, kind: Any, found: Found | None, base: Any = None) -> Any:
+        del base
         return (models, kind, "" if found is None else found.effect.name)
 
     def run(self, tasks: dict[Any, Any], label: str) -> dict[Any, Tried]:
@@ -139,6 +142,37 @@ def test_a_round_that_the_time_limit_cuts_short_confirms_no_pair() -> None:
     refits = Trials(tried(60.0), alone, early=True)
     judged = [refits.candidate(STEP, 1e-4), refits.candidate(INPUT, 1e-3)]
     assert confirmed_together(refits, judged, 0.05) is None
+
+
+ZONE = with_channel(MODEL, DeadZone("u0", -0.5, 0.5))
+SPRING = with_feedback(MODEL)
+
+
+def kept(effect: Any, model: Any) -> Judged:
+    """An effect of which this model was kept."""
+    found = Found(effect, Evidence(effect.name, 5.0, 1e-5, 1.0, 0.1), 1e-4)
+    return judge(found, kind_of(found), replace(tried(5.0, 9.0), model=model, fit=model),
+                 Tried(MODEL, np.zeros(SAMPLES), 0.0), 1, SETTINGS)  # fmt: skip
+
+
+def test_numbers_that_were_found_are_not_looked_for_once_more() -> None:
+    """A dead zone goes to the spring as it was kept, and the fit with the spring goes on."""
+    zone, spring = kept(effects.DeadZoneOfInput(), ZONE), kept(effects.NonlinearFeedbackOfOutput(), SPRING)
+    for order in ([zone, spring], [spring, zone]):
+        asked: list[Any] = []
+
+        class Once(Trials):
+            def trial(self, models: Any, kind: Any, found: Any, base: Any = None) -> Any:
+                asked.append((models, found, base))
+                return super().trial(models, kind, found)
+
+        refits = Once(tried(60.0), {})
+        found = confirmed_together(refits, order, 0.05)
+        assert found is not None
+        ((models, effect, base),) = asked
+        assert models == (with_channel(SPRING, ZONE.channels[0]),)
+        assert effect is None
+        assert base is SPRING  # what stands for its fit
 
 
 def masked(seed: int) -> dgp.Record:

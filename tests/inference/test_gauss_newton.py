@@ -102,6 +102,32 @@ def test_energy_and_gradient_of_the_vectors_density(name):
     np.testing.assert_allclose(here.gradient, gradient, rtol=1e-4, atol=1e-4 * size)
 
 
+@pytest.mark.parametrize("name", CASES)
+def test_energy_and_gradient_with_the_slopes_of_another_point(name):
+    """The same where the point is that one."""
+    innovations, z = prepared(name)
+    here = innovations.local(z)
+    energy, gradient = innovations.beside(here, z)
+    size = np.abs(here.gradient).max()
+    assert energy == pytest.approx(here.energy, rel=1e-12)
+    np.testing.assert_allclose(gradient, here.gradient, rtol=1e-9, atol=1e-9 * size)
+
+
+def test_slopes_of_another_point_are_exact_where_predictions_are_linear():
+    """In gains and levels, the noise being the same."""
+    plain, z = prepared("known trajectory")
+    free = plain.potential.places(("g_input_gain", "offset"))
+    innovations = Innovations(plain.potential, free)
+    here = innovations.local(z)
+    other = z.copy()
+    other[free] += 0.3 * np.random.default_rng(1).standard_normal(len(free))
+    energy, gradient = innovations.beside(here, other)
+    exact = innovations.local(other)
+    assert energy == pytest.approx(exact.energy, rel=1e-12)
+    np.testing.assert_allclose(gradient, exact.gradient, rtol=1e-5)
+    assert np.abs(exact.gradient - here.gradient).max() > 1.0
+
+
 def test_energy_and_gradient_with_fixed_sites():
     """Their priors count, and nothing moves along them."""
     whole, z = prepared("Wiener")
@@ -212,7 +238,7 @@ def test_a_climb_with_functions_ends_on_a_ridge(monkeypatch, functions, steps):
     gains = 0.9 * RIDGE / FEW
     local = Local(
         0.0, -np.ones(len(z)), np.eye(len(z)), np.zeros((len(z),) * 2), np.zeros((2, 3)),
-        np.ones(3), np.zeros((2, len(z), 3)),
+        np.ones(3), np.zeros((2, len(z), 3)), np.zeros(len(z)),
     )  # fmt: skip
     level = [0.0]
 

@@ -1,14 +1,14 @@
 """Posterior of numbers that a model is made with rather than samples: a delay, a limit, a period.
 
 Such a number moves an input along the time axis or bends it, and the density is not smooth in it.
-At each of several values the sample sites climb to their mode again, in coordinates that are round
-at the fitted number, and
+At each of several values the sample sites climb to their mode again, and
 
     p(number | y) = exp(-E(number)) / integral over the number,
 
 E the negative log joint density at that mode. This is Laplace's approximation of the integral over
 the sites (Tierney & Kadane, J. Am. Stat. Assoc. 81:82, 1986) with one curvature for all values of
-the number, whose prior is flat within its bounds.
+the number, whose prior is flat within its bounds. Kernels of functions keep their values: they are
+those of the highest evidence, not of the mode.
 """
 
 from __future__ import annotations
@@ -21,7 +21,11 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from pyro_dynogp.inference.density import WALL, Potential
+from pyro_dynogp.inference.function_evidence import kernel_sites
+from pyro_dynogp.inference.log_joint import Direct
+from pyro_dynogp.inference.optimise.chord import along_chord
 from pyro_dynogp.inference.optimise.descent import bounded_root, piece
+from pyro_dynogp.inference.optimise.gauss_newton import Innovations, climb, has_innovations
 
 # Nats below the top at which the density counts as zero; how often a range is doubled or halved to
 # find that depth; points of the grid for each of two numbers.
@@ -38,9 +42,14 @@ RISE, NEWS, SHARE = 60.0, 0.3, 0.1
 ITERATIONS = 30
 # Gradient, in coordinates that are round at the fitted number, at which they are there.
 FLAT = 0.05
+# With functions: most iterations at the fitted number, and nats that they gain when they end; most
+# with the derivatives that predictions have there, and nats that are left when they end.
+MOST_NEWTON, RIDGE, CHORDS, LEFT = 60, 0.02, 8, 0.2
 # Negative log densities, up to a constant, of several values of the number or numbers; infinite
 # where they cannot be evaluated.
 Energies = Callable[[Sequence[tuple[float, ...]]], np.ndarray]
+# Lowest energy of the sites, from a point on, and where it is.
+Descent = Callable[[Potential, np.ndarray], tuple[float, np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -76,8 +85,7 @@ def number_posterior(
     centre = tuple(one.at for one in numbers)
     steps = np.array([one.step for one in numbers])
     first = potential(centre)
-    z = first.pack(first.at).numpy()
-    root = bounded_root(first.hessian(z))
+    lowest, z = _descent(first)
     known: dict[tuple[float, ...], tuple[float, np.ndarray]] = {}
 
     def energies(many: Sequence[tuple[float, ...]]) -> np.ndarray:
@@ -91,7 +99,7 @@ def number_posterior(
                 tasks[values] = potential(values), start
             except ValueError:  # numbers that make no model, as limits that cross: no density
                 known[values] = np.inf, start
-        known.update(zip(tasks, _lowest(list(tasks.values()), root), strict=True))
+        known.update((values, lowest(*task)) for values, task in tasks.items())
         return np.array([known[values][0] for values in many])
 
     energies([centre])  # where all others start
@@ -233,15 +241,55 @@ def _moments(x: np.ndarray, share: np.ndarray) -> tuple[float, float]:
     return mean, float(np.sqrt(share @ (x - mean) ** 2))
 
 
-def _lowest(
-    tasks: Sequence[tuple[Potential, np.ndarray]], root: np.ndarray
-) -> list[tuple[float, np.ndarray]]:
-    """Lowest energies from points on, to a few hundredths of a nat, and where they are."""
-    ends = [
-        piece(potential.with_jacobian, start, root, ITERATIONS, [], flat=FLAT)
-        for potential, start in tasks
-    ]
-    return [(energy if energy < WALL else np.inf, z) for z, energy, _ in ends]
+def _descent(first: Potential) -> tuple[Descent, np.ndarray]:
+    """How sites climb to their mode at other numbers, and from where on.
+
+    Energies to a few hundredths of a nat. With functions by Gauss-Newton, else in coordinates that
+    are round at the mode.
+
+    Args:
+        first: with the fitted number, at the fit's mode.
+    """
+    z = first.pack(first.at).numpy()
+    density = first.log_density
+    model = density.model if isinstance(density, Direct) else None
+    if model is not None and model.has_function and has_innovations(model):
+        return _by_innovations(first, z, kernel_sites(model))
+    root = bounded_root(first.hessian(z))
+
+    def lowest(potential: Potential, start: np.ndarray) -> tuple[float, np.ndarray]:
+        end, energy, _ = piece(potential.with_jacobian, start, root, ITERATIONS, [], flat=FLAT)
+        return (energy if energy < WALL else np.inf), end
+
+    return lowest, z
+
+
+def _by_innovations(
+    first: Potential, z: np.ndarray, held: Sequence[str]
+) -> tuple[Descent, np.ndarray]:
+    """`_descent` with the derivatives of the first number's predictions for as long as they serve.
+
+    L-BFGS stops on the ridges that functions have, tens of nats too high: only the number of the
+    fit is low then, and seems to be certain.
+    """
+    free = np.setdiff1d(np.arange(first.size), first.places(held))
+
+    def innovations(potential: Potential) -> Innovations:
+        return Innovations(potential, free, jacobian=True)
+
+    z, _, _ = climb(innovations(first), z, MOST_NEWTON, ridge=RIDGE)
+    here = innovations(first).local(z)
+
+    def lowest(potential: Potential, start: np.ndarray) -> tuple[float, np.ndarray]:
+        own = innovations(potential)
+        if here is not None:
+            energy, start, there = along_chord(own, here, start, CHORDS, LEFT)
+            if there:
+                return energy, start
+        end, history, _ = climb(own, start, ITERATIONS)
+        return (history[-1] if history else np.inf), end
+
+    return lowest, z
 
 
 def _range(

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 # Change of the unconstrained vector over which a change is a derivative.
 STEP = 1e-6
 # Numbers that a filter may keep of all points that go through it together.
-KEPT = 40_000_000
+KEPT = 100_000_000
 # Dampings that are tried, as multiples of the last that was best; largest change of an entry.
 DAMPINGS = np.array([1e-4, 1e-2, 0.1, 1.0, 10.0, 1e3])
 LONGEST = 2.0
@@ -86,7 +86,7 @@ class Local:
         energy: -log p(y, values). gradient: (d,). fisher: (d, d), of the outputs.
         prior: (d, d), curvature of the prior.
         level: (2, N) sqrt(a) errors over their sd, and sqrt(b / 2) log variances. sd: (N,).
-        slopes: (2, d, N) their derivatives.
+        slopes: (2, d, N) their derivatives. rest: (d,) gradient of what is added to the densities.
     """
 
     energy: float
@@ -96,6 +96,7 @@ class Local:
     level: np.ndarray
     sd: np.ndarray
     slopes: np.ndarray
+    rest: np.ndarray
 
 
 class Innovated(NamedTuple):
@@ -154,20 +155,38 @@ class Innovations:
             level = self._level(errors, variances, sd)
             slopes = (level[:, 1:] - level[:, :1]) / STEP
             first = level[:, 0]
-            of_variance = math.sqrt(0.5 / self._of_variance)
-            weights = np.stack([
-                first[0] / self._of_mean, of_variance * (1.0 - first[0] ** 2 / self._of_mean)
-            ])  # fmt: skip
             gradients = gradients[:, self.free]
-            gradient = gradients[0] + sum(J @ w for J, w in zip(slopes, weights, strict=True))
-            gradient -= (rest[1:] - rest[0]).sum(1) / STEP
+            of_rest = (rest[1:] - rest[0]).sum(1) / STEP
+            gradient = gradients[0] + self._slope(slopes, first[0], first[0] ** 2) - of_rest
             energy = float(prior[0]) + float(_energies(innovated)[0])
             curvature = (gradients[1:] - gradients[0]) / STEP
             curvature = 0.5 * (curvature + curvature.T)
             fisher = sum(J @ J.T for J in slopes)
         if not all(np.isfinite(part).all() for part in (energy, gradient, fisher, curvature)):
             return None
-        return Local(energy, gradient, fisher, curvature, first, sd, slopes)
+        return Local(energy, gradient, fisher, curvature, first, sd, slopes, of_rest)
+
+    def beside(self, here: Local, z: np.ndarray) -> tuple[float, np.ndarray]:
+        """Energy at z (d,), and its gradient with the predictions' derivatives of another point."""
+        innovated = self._innovations(z[None])
+        (errors,), (variances,), _ = innovated
+        (prior,), (gradient,) = self._prior(z[None])
+        with np.errstate(all="ignore"):
+            energy = float(prior + _energies(innovated)[0])
+            share = math.sqrt(self._of_mean) * errors * (here.sd / variances)
+            own = self._slope(here.slopes, share, self._of_mean * errors**2 / variances)
+        return energy, gradient[self.free] + own - here.rest
+
+    def _slope(self, slopes: np.ndarray, share: np.ndarray, squares: np.ndarray) -> np.ndarray:
+        """Gradient (d,) of the normal densities.
+
+        Args:
+            slopes: of `Local`. share, squares: (N,) a^1/2 e s / d, s being the sds of the slopes,
+                and a e^2 / d.
+        """
+        of_variance = math.sqrt(0.5 / self._of_variance)
+        weights = (share / self._of_mean, of_variance * (1.0 - squares / self._of_mean))
+        return np.asarray(sum(J @ w for J, w in zip(slopes, weights, strict=True)))
 
     def bends(self, here: Local, z: np.ndarray, moves: np.ndarray) -> np.ndarray:
         """Second derivatives along moves (k, d) from z (d,), projected on the slopes (k, free)."""
@@ -236,12 +255,12 @@ def _finite(energies: np.ndarray) -> np.ndarray:
 
 
 def climb(
-    innovations: Innovations, z: np.ndarray, steps: int
+    innovations: Innovations, z: np.ndarray, steps: int, *, ridge: float = RIDGE
 ) -> tuple[np.ndarray, list[float], str]:
     """Lowest point from z (d,) on, the energy after each iteration, and why it ended.
 
     Args:
-        innovations: of the model. steps: most iterations.
+        innovations: of the model. steps: most iterations. ridge: nats, see `RIDGE`.
     """
     history: list[float] = []
     damping = 1.0
@@ -272,7 +291,7 @@ def climb(
             damping *= 1e4
         if gain < FLAT and (left < FLAT or _lately(history, PATIENCE) < FLAT):
             return z, history, DONE
-        if innovations.has_functions and _lately(history, FEW) < RIDGE:
+        if innovations.has_functions and _lately(history, FEW) < ridge:
             return z, history, DONE
         if damping > 1e4 * curvature.max():
             return z, history, "no step gains anything"

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+import torch
 
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.starts.delays import with_delays
@@ -73,7 +74,16 @@ def extended_starts(
         new, *starts = [starting_point(model, records, plan) for plan in plans]
     if rescaled and leading is not None:  # scaled as the other signals ask for
         learnt = {k: v for k, v in learnt.items() if not k.startswith(f"{leading.name}_")}
-    return [grown(learnt, start, sites) for start in starts], new
+    return _distinct([grown(learnt, start, sites) for start in starts]), new
+
+
+def _distinct(starts: Sequence[Values]) -> list[Values]:
+    """Each start once: they differ in what is new alone, and of a layer that is learnt in nothing."""
+    found: list[Values] = []
+    for start in starts:
+        if not any(all(torch.equal(x, one[name]) for name, x in start.items()) for one in found):
+            found.append(start)
+    return found
 
 
 def _given_poles(
