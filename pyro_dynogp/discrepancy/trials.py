@@ -16,10 +16,12 @@ from pyro_dynogp.effects.base import Compared, Score
 from pyro_dynogp.fitting import Fit
 from pyro_dynogp.inference.refit import energy, race, refit
 from pyro_dynogp.inference.run import Run
-from pyro_dynogp.models.delays import comparable
+from pyro_dynogp.models.delays import comparable, longest_delay
 from pyro_dynogp.models.variants import Model, with_usual_substeps
 from pyro_dynogp.statistics.settings import LoopSettings
 
+# Most steps of one size that a number of a variant takes.
+MOVES = 4
 # A signal that varies by no more than this share of its size is constant, as for a fit.
 CONSTANT = 1e-12
 
@@ -142,9 +144,9 @@ def _kept(trial: Trial, training: Record) -> Fit:
         if not found:
             raise ValueError(problems[0])
         start = found[0]
+        longest = trial.settings.reach * longest_delay(*trial.models, *finer)
         for times in range(trial.settings.refinements):
-            finer = _finer(trial, _unscaled(start), training, times)
-            start = min([start, *race(start, finer, same, trial.run)[0]], key=energy)
+            start = _refined(trial, start, training, same, times, longest)
         model = start.model
     return refit(start, training, model=model, run=trial.run)
 
@@ -152,6 +154,28 @@ def _kept(trial: Trial, training: Record) -> Fit:
 def _finer(trial: Trial, model: Model, training: Record, times: int) -> Sequence[Model]:
     """Variants close to a model."""
     return [] if trial.refine is None else trial.refine(model, training, times)
+
+
+def _refined(
+    trial: Trial, start: Fit, training: Record, same: Record, times: int, longest: float
+) -> Fit:
+    """The best of variants close to one, then of those close to that, for as long as they gain.
+
+    Hooke & Jeeves (J. ACM 8:212, 1961): steps are made smaller where none of them leads further.
+
+    Args:
+        start: a mode. same: the training data on which variants are compared. times: which steps.
+        longest: delay that variants may have there.
+    """
+    for _ in range(MOVES):
+        close = _finer(trial, _unscaled(start), training, times)
+        known = [one for one in close if longest_delay(one) <= longest]
+        best = min([start, *race(start, known, same, trial.run)[0]], key=energy)
+        further = energy(start) - energy(best) > trial.settings.gain
+        start = best
+        if not further:
+            break
+    return start
 
 
 def _best_ahead(trial: Trial, training: Record) -> Fit:

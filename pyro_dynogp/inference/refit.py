@@ -196,14 +196,22 @@ def _held(model: Model, optimizer: Optimizer) -> tuple[str, ...]:
     return kernel_sites(model) if held else ()
 
 
-def _settled(problem: Problem, optima: list[Optimum], run: Run) -> list[Optimum]:
+def _settled(
+    problem: Problem, optima: list[Optimum], run: Run, *, other: bool = False
+) -> list[Optimum]:
     """The best optimum with kernels by the evidence; without feedback, and of variants, all optima.
 
-    Variants are compared at the mode, and others keep the kernels that they have.
+    Variants are compared at the mode. Without feedback others keep the kernels that they have, but
+    functions that were learnt next to other inputs or dynamics: what these lacked was in them.
+
+    Args:
+        other: whether the functions were.
     """
-    if run.steps or not problem.target.has_feedback:
+    target = problem.target
+    learnt = target.has_feedback or (other and optimizer_for(target) != "adam")
+    if run.steps or not learnt:
         return optima
-    return kernels_by_evidence(problem.target, problem.records, optima[:1], run)
+    return kernels_by_evidence(target, problem.records, optima[:1], run)
 
 
 def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
@@ -212,10 +220,12 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     What is new is found along the excerpt, and goes on along the whole.
     """
     target = problem.target
-    new = target.has_feedback and not have_same_parameters(target, fit.model)
-    excerpt = problem.beginning(LONG, EXCERPT) if new and not run.steps else None
+    new = not have_same_parameters(target, fit.model)
+    looped = new and target.has_feedback and not run.steps
+    excerpt = problem.beginning(LONG, EXCERPT) if looped else None
     if excerpt is None:
-        return _settled(problem, _climbed(fit, problem, run), run)
+        other = new and len(target.layers) == len(fit.model.layers)
+        return _settled(problem, _climbed(fit, problem, run), run, other=other)
     (best, *_) = _climbed(fit, excerpt, run)
     optimizer = optimizer_near(target)
     optima = maximise(

@@ -10,6 +10,7 @@ import pytest
 import pyro_dynogp as dgp
 from pyro_dynogp import effects
 from pyro_dynogp.data.channels import Delayed, Recorded, Step, Trend
+from pyro_dynogp.discrepancy import trials
 from pyro_dynogp.discrepancy.held_out import forecast_errors, held_out_density
 from pyro_dynogp.discrepancy.search import candidates_of
 from pyro_dynogp.discrepancy.trials import Trial, run, why_not
@@ -19,6 +20,7 @@ from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.refit import energy, race, refit
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.extended import extended_starts
+from pyro_dynogp.models.delays import longest_delay, unknown_beginning
 from pyro_dynogp.models.variants import (
     with_channel,
     with_output_function,
@@ -233,3 +235,45 @@ def test_a_saturation_knows_its_limits_and_a_function_goes_on_as_a_line():
         with_channel(MODEL, Trend(0.0, 1.0)),
     ):
         assert last(effects.Saturation(), model, limits).limits is None
+
+
+def test_limits_are_followed_for_as_long_as_they_gain():
+    """From a test that was a quarter of the width off; two steps of each size do not lead there."""
+    rng = np.random.default_rng(0)
+    u = 1.5 * coloured(rng, 600, 0.6)
+    system = System(np.array([-0.3 + 0.4j]), np.array([[0.3 - 0.2j]]))
+    y = response(system, (u - np.clip(u, -0.5, 0.9))[:, None])
+    y = y / y.std() + 0.05 * rng.standard_normal(len(y))
+    record = dgp.Record(STEP * np.arange(len(y)), u[:, None], y[:, None], input_names=("u",))
+    fold = np.arange(len(y)) >= 500
+    fit = fitted_mode(MODEL, record[:500])
+    effect = effects.DeadZoneOfInput()
+    found = spoken_for(effect, 1e-9, 1e-9, channel="u", low=-0.9, high=0.5)
+    variants = tuple(effect.extend(MODEL, found.evidence, record))
+    trial = Trial(variants, record, (fold,), fit, 0, SETTINGS, "forecast", refine=effect.refine)
+    (zone,) = run(trial).model.channels
+    assert zone.low == pytest.approx(-0.5, abs=0.06)
+    assert zone.high == pytest.approx(0.9, abs=0.06)
+
+
+def test_no_variant_is_later_than_all_are_compared_for(monkeypatch, record, base):
+    """Beyond that it would have fewer samples than the others."""
+    asked = []
+
+    def noted(fit, models, same, run):
+        asked.append((longest_delay(*models), int(np.isnan(same.outputs[:, 0]).sum())))
+        return race(fit, models, same, run)
+
+    monkeypatch.setattr(trials, "race", noted)
+    fold = np.arange(len(record)) >= 200
+    # Each time something later is near, and looks better than it is.
+    steps = iter([later(4.0), later(5.0), later(6.0), later(9.0), later(12.0)])
+    trial = Trial(
+        (later(2.0), later(3.0)), record, (fold,), base, 0, SETTINGS, "forecast",
+        refine=lambda model, data, times: [next(steps, later(20.0))],
+    )  # fmt: skip
+    run(trial)
+    assert len(asked) > 2
+    longest = SETTINGS.reach * 4.0 * STEP
+    assert all(delay <= longest + 1e-12 for delay, _ in asked)
+    assert {missing for _, missing in asked} == {unknown_beginning(record, longest)}

@@ -8,11 +8,13 @@ import pytest
 import torch
 
 import pyro_dynogp as dgp
+from pyro_dynogp.data.channels import Delayed
 from pyro_dynogp.inference import refit as refits
+from pyro_dynogp.inference.function_evidence import kernel_sites
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.refit import optima_of, refit
 from pyro_dynogp.inference.run import Run
-from pyro_dynogp.models.variants import with_feedback
+from pyro_dynogp.models.variants import with_channel, with_feedback
 from tests.inference.cascades import FAST, wiener
 from tests.models.closed_loops import make_record
 
@@ -154,3 +156,36 @@ def test_what_is_new_in_feedback_is_looked_for_along_an_excerpt_of_long_records(
     climbs.clear()
     refit(again, record, model=again.model)  # nothing is new
     assert climbs == [(80, 1)]
+
+
+def late_and_bent(seed: int) -> dgp.Record:
+    """A bent input, seven samples late, through a well damped second order."""
+    rng = np.random.default_rng(seed)
+    n, step, late = 900, 0.1, 7
+    u = np.repeat(1.5 * rng.standard_normal(n // 6), 6)
+    force = np.tanh(np.concatenate([np.zeros(late), u[:-late]]))
+    x = v = 0.0
+    y = np.zeros(n)
+    for k, f in enumerate(force):
+        y[k] = x
+        for _ in range(10):
+            v += 0.1 * step * (4.0 * f - 1.2 * v - 4.0 * x)
+            x += 0.1 * step * v
+    y += 0.03 * y.std() * rng.standard_normal(n)
+    return dgp.Record(step * np.arange(n), u[:, None], y[:, None], input_names=("u",))
+
+
+def test_kernels_are_learnt_again_next_to_what_was_lacking():
+    """A function that was learnt without the dead time is rough; the right one is not."""
+    record = late_and_bent(1)
+    fit = dgp.fit(dgp.Hammerstein(1, pairs=1), record[:600], method="map", workers=1,
+                  progress=False)  # fmt: skip
+    model = replace(fit.model, scaling=None)
+    late = refit(fit, record[:600], model=with_channel(model, Delayed("u", 0.7)))
+    error = late.forecast(record[:600], record[600:]).mean - record.outputs[600:]
+    noise = 0.03 * record.outputs.std()
+    assert np.sqrt(np.mean(error**2)) < 1.5 * noise  # with the old kernels 3.7 times
+    # The same model on other data keeps them.
+    again = refit(late, record[:590])
+    for name in kernel_sites(late.model):
+        assert torch.equal(again.mode[name], late.mode[name])
