@@ -10,6 +10,7 @@ from pyro_dynogp.discrepancy.held_out import certain
 from pyro_dynogp.discrepancy.judged import SPREAD, Judged, Kind, judge
 from pyro_dynogp.discrepancy.refits import Refits
 from pyro_dynogp.discrepancy.search import extended_by
+from pyro_dynogp.discrepancy.trials import Trial
 from pyro_dynogp.models.variants import Model, with_channels_of
 
 # Effects of which pairs are tried.
@@ -36,6 +37,13 @@ class Pair:
         first, second = self.members
         return SPREAD if second.kind == SPREAD else first.kind
 
+    def trial(self, refits: Refits) -> Trial:
+        """Of both."""
+        first, second = self.members
+        if self.complete:
+            return refits.trial(self.models, self.kind, None, base=first.tried.fit)
+        return refits.trial(self.models, self.kind, second.found)
+
 
 def confirmed_together(refits: Refits, judged: Sequence[Judged], level: float) -> Judged | None:
     """The first of two effects that help together, and neither alone; None where there are none.
@@ -50,16 +58,7 @@ def confirmed_together(refits: Refits, judged: Sequence[Judged], level: float) -
             tests.
     """
     pairs = _pairs(refits, judged, level)
-    together = refits.run(
-        {
-            k: refits.trial(
-                one.models, one.kind, None if one.complete else one.members[1].found,
-                base=one.members[0].tried.fit if one.complete else None,
-            )
-            for k, one in enumerate(pairs)
-        },
-        "joint refits",
-    )
+    together = refits.run({k: pair.trial(refits) for k, pair in enumerate(pairs)}, "joint refits")
     spread = refits.on_spread_blocks(
         [one for pair in pairs if pair.kind == SPREAD for one in pair.members]
     )

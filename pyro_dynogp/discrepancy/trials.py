@@ -148,6 +148,8 @@ def _kept(trial: Trial, training: Record) -> Fit:
         for times in range(trial.settings.refinements):
             start = _refined(trial, start, training, same, times, longest)
         model = start.model
+        if model.has_function:  # few steps may have led to a poor optimum
+            start, model = trial.base, _unscaled(start)
     return refit(start, training, model=model, run=trial.run)
 
 
@@ -168,12 +170,14 @@ def _refined(
         longest: delay that variants may have there.
     """
     for _ in range(MOVES):
-        close = _finer(trial, _unscaled(start), training, times)
+        here = _unscaled(start)
+        close = _finer(trial, here, training, times)
         known = [one for one in close if longest_delay(one) <= longest]
-        best = min([start, *race(start, known, same, trial.run)[0]], key=energy)
-        further = energy(start) - energy(best) > trial.settings.gain
-        start = best
-        if not further:
+        # The variant itself takes part: all climb further in a race.
+        ranked, _ = race(start, [here, *known], same, trial.run)
+        own = next(one for one in ranked if _unscaled(one) == here)
+        start = ranked[0]
+        if energy(own) - energy(start) <= trial.settings.gain:
             break
     return start
 

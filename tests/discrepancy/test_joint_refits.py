@@ -155,21 +155,25 @@ def kept(effect: Any, model: Any) -> Judged:
                  Tried(MODEL, np.zeros(SAMPLES), 0.0), 1, SETTINGS)  # fmt: skip
 
 
+@dataclass
+class Noted(Trials):
+    """With what trials of both effects are asked for."""
+
+    both_of: list[Any] = field(default_factory=list)
+
+    def trial(self, models: Any, kind: Any, found: Found | None, base: Any = None) -> Any:
+        self.both_of.append((models, found, base))
+        return super().trial(models, kind, found)
+
+
 def test_numbers_that_were_found_are_not_looked_for_once_more() -> None:
     """A dead zone goes to the spring as it was kept, and the fit with the spring goes on."""
-    zone, spring = kept(effects.DeadZoneOfInput(), ZONE), kept(effects.NonlinearFeedbackOfOutput(), SPRING)
+    zone = kept(effects.DeadZoneOfInput(), ZONE)
+    spring = kept(effects.NonlinearFeedbackOfOutput(), SPRING)
     for order in ([zone, spring], [spring, zone]):
-        asked: list[Any] = []
-
-        class Once(Trials):
-            def trial(self, models: Any, kind: Any, found: Any, base: Any = None) -> Any:
-                asked.append((models, found, base))
-                return super().trial(models, kind, found)
-
-        refits = Once(tried(60.0), {})
-        found = confirmed_together(refits, order, 0.05)
-        assert found is not None
-        ((models, effect, base),) = asked
+        refits = Noted(tried(60.0), {})
+        assert confirmed_together(refits, order, 0.05) is not None
+        ((models, effect, base),) = refits.both_of
         assert models == (with_channel(SPRING, ZONE.channels[0]),)
         assert effect is None
         assert base is SPRING  # what stands for its fit

@@ -277,3 +277,19 @@ def test_no_variant_is_later_than_all_are_compared_for(monkeypatch, record, base
     longest = SETTINGS.reach * 4.0 * STEP
     assert all(delay <= longest + 1e-12 for delay, _ in asked)
     assert {missing for _, missing in asked} == {unknown_beginning(record, longest)}
+
+
+def test_functions_are_fitted_from_the_base_once_a_variant_is_chosen(monkeypatch, record):
+    """Few steps of a race may lead to a poor optimum; a linear model goes on from there."""
+    fold, calls = np.arange(N) >= 200, []
+
+    def noted(fit, records, *, model=None, run=None):
+        calls.append(fit)
+        return refit(fit, records, model=model, run=run)
+
+    monkeypatch.setattr(trials, "refit", noted)
+    for model in (MODEL, dgp.Hammerstein(1, pairs=1, inducing=8, process_noise=False)):
+        start = fitted_mode(model, record[:200])
+        variants = tuple(with_channel(model, Delayed("u", k * STEP)) for k in (4, 5))
+        run(Trial(variants, record, (fold,), start, 0, SETTINGS, "forecast"))
+        assert (calls[-1] is start) == model.has_function

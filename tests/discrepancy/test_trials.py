@@ -139,9 +139,12 @@ def test_a_climb_without_process_noise_comes_first(monkeypatch, record, base):
         return found
 
     monkeypatch.setattr(refits, "maximise", recorded)
-    training, run = record[:TRAINING], Run(0, workers=1, steps=5)
-    found = refit(base, training, model=base.model, run=run)
-    (_, new) = extended_starts(base, base.model, base.model.prepare(training), 0)
+    monkeypatch.setattr(refits, "LAYERED_STEPS", 5)
+    training, run = record[:TRAINING], Run(0, workers=1)
+    model = with_channel(replace(base.model, scaling=None), Recorded("w"))
+    found = refit(base, training, model=model, run=run)
+    problem = Problem.of(model, [training])
+    (_, new) = extended_starts(base, problem.target, problem.records, 0)
     (quiet, (loud,), without), (_, (first, second), optima) = calls
     assert not quiet.layers[0].process_noise
     assert float(loud["noise_sd"]) >= 0.5
@@ -149,11 +152,12 @@ def test_a_climb_without_process_noise_comes_first(monkeypatch, record, base):
     torch.testing.assert_close(second["f_values"], without[0].values["f_values"])
     torch.testing.assert_close(second["g_noise_gain_unit"], new["g_noise_gain_unit"])
     assert found.start_energies.tolist() == [one.energy for one in optima]
-    # Where there is no such noise one climb is enough.
-    calls.clear()
-    refit(base, training, model=without_process_noise(base.model), run=run)
-    ((_, starts, _),) = calls
-    assert len(starts) == 1
+    # Where there is no such noise, and to compare variants, one climb is enough.
+    for one, own in ((without_process_noise(model), run), (model, replace(run, steps=5))):
+        calls.clear()
+        refit(base, training, model=one, run=own)
+        ((_, starts, _),) = calls
+        assert len(starts) == 1
 
 
 def test_models_without_process_noise_stay_as_they_are():

@@ -1,4 +1,4 @@
-"""Numbers of models with functions: whichever number the fit was made with, the posterior is one."""
+"""Numbers of models with functions: the posterior does not depend on that of the fit."""
 
 from __future__ import annotations
 

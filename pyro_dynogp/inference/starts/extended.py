@@ -78,7 +78,7 @@ def extended_starts(
 
 
 def _distinct(starts: Sequence[Values]) -> list[Values]:
-    """Each start once: they differ in what is new alone, and of a layer that is learnt in nothing."""
+    """Each start once: where no layer is new they do not differ."""
     found: list[Values] = []
     for start in starts:
         if not any(all(torch.equal(x, one[name]) for name, x in start.items()) for one in found):
