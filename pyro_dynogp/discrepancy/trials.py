@@ -173,6 +173,8 @@ def _refined(
         here = _unscaled(start)
         close = _finer(trial, here, training, times)
         known = [one for one in close if longest_delay(one) <= longest]
+        if not known:
+            break
         # The variant itself takes part: all climb further in a race.
         ranked, _ = race(start, [here, *known], same, trial.run)
         own = next(one for one in ranked if _unscaled(one) == here)

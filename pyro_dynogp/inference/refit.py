@@ -251,7 +251,7 @@ def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
 
     Process noise that has explained what the smaller model lacks keeps the larger one from
     explaining it: one climb goes without any first, and takes that of a fresh start then. Not where
-    variants are compared, of which the order is the same.
+    variants are compared: their order is the same without.
     """
     target, records = problem.target, problem.records
     starts, new = extended_starts(fit, problem.model, records, run.seed)

@@ -273,7 +273,7 @@ def test_no_variant_is_later_than_all_are_compared_for(monkeypatch, record, base
         refine=lambda model, data, times: [next(steps, later(20.0))],
     )  # fmt: skip
     run(trial)
-    assert len(asked) > 2
+    assert len(asked) > 1
     longest = SETTINGS.reach * 4.0 * STEP
     assert all(delay <= longest + 1e-12 for delay, _ in asked)
     assert {missing for _, missing in asked} == {unknown_beginning(record, longest)}
@@ -293,3 +293,16 @@ def test_functions_are_fitted_from_the_base_once_a_variant_is_chosen(monkeypatch
         variants = tuple(with_channel(model, Delayed("u", k * STEP)) for k in (4, 5))
         run(Trial(variants, record, (fold,), start, 0, SETTINGS, "forecast"))
         assert (calls[-1] is start) == model.has_function
+
+
+def test_what_has_no_finer_variants_races_once(monkeypatch, record, base):
+    asked = []
+
+    def noted(fit, models, same, run):
+        asked.append(len(models))
+        return race(fit, models, same, run)
+
+    monkeypatch.setattr(trials, "race", noted)
+    fold = np.arange(len(record)) >= 200
+    run(Trial((later(4.0), later(5.0)), record, (fold,), base, 0, SETTINGS, "forecast"))
+    assert asked == [2]

@@ -244,8 +244,8 @@ def _moments(x: np.ndarray, share: np.ndarray) -> tuple[float, float]:
 def _descent(first: Potential) -> tuple[Descent, np.ndarray]:
     """How sites climb to their mode at other numbers, and from where on.
 
-    Energies to a few hundredths of a nat. With functions by Gauss-Newton, else in coordinates that
-    are round at the mode.
+    With functions by Gauss-Newton, to some tenths of a nat; else in coordinates that are round at
+    the mode, to a few hundredths.
 
     Args:
         first: with the fitted number, at the fit's mode.

@@ -13,8 +13,6 @@ from pyro_dynogp.inference.optimise.gauss_newton import Innovations, Local
 
 # Least curvature: along what hardly curves a gradient that is nearly right leads far away.
 LEAST = 1.0
-
-
 # Shares of a step that are tried until one leads lower.
 SHARES = (1.0, 0.3, 0.1)
 
