@@ -264,13 +264,6 @@ def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
             effort=effort, held=_held(model, optimizer),
         )  # fmt: skip
 
-    if target.is_linear:
-        if run.steps:
-            return climbed(target, [most_probable(problem, starts)], run.steps)
-        before, after = (one.dynamic[0][1] for one in (fit.model, target))
-        more = after.pairs > before.pairs or after.integrators > before.integrators
-        fresh = linear_starts(target, records, None, run.seed) if more else []
-        return climbed(target, [*fresh, *starts], LINEAR_STEPS)
     if len(target.layers) > len(fit.model.layers):
         if not (run.steps or (target.has_feedback and fit.model.is_linear)):
             starts += starting_points(target, records, run, count=FRESH, steps=FRESH_STEPS)
@@ -279,6 +272,11 @@ def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
                      steps=run.steps or ADDED_STEPS[optimizer])  # fmt: skip
     if run.steps:  # a few, to compare variants
         return climbed(target, [most_probable(problem, starts)], run.steps)
+    if target.is_linear:
+        before, after = (one.dynamic[0][1] for one in (fit.model, target))
+        more = after.pairs > before.pairs or after.integrators > before.integrators
+        fresh = linear_starts(target, records, None, run.seed) if more else []
+        return climbed(target, [*fresh, *starts], LINEAR_STEPS)
     if have_same_parameters(target, fit.model):  # nothing is new
         return climbed(target, starts[:1], LAYERED_STEPS)
     quiet = without_noise_below_functions(target)

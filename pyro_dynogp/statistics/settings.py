@@ -62,7 +62,7 @@ class LoopSettings:
             Evidence: none.
         folds: blocks of the record on which effects of one instant are scored.
             Evidence: none.
-        refinements: how often the best variant of an effect is refined.
+        refinements: sizes of steps by which the best variant of an effect is refined.
             Evidence: cost.
         reach: times the longest delay of the first variants that a refined one may come to.
             Evidence: reason: variants are compared on the same samples.

@@ -44,7 +44,8 @@ def test_it_leads_to_the_minimum(at_minimum) -> None:
     assert innovations.energies(beside[None])[0] > here.energy + 10.0
     energy, end, there = along_chord(innovations, here, beside, 8, 0.2)
     assert there
-    assert energy == pytest.approx(here.energy, abs=0.25)
+    assert energy == pytest.approx(here.energy, abs=0.25)  # 0.2 nats may be left
+    # One point and several of them are added up in another order.
     assert energy == pytest.approx(innovations.energies(end[None])[0], rel=1e-12)
     held = np.setdiff1d(np.arange(len(z)), innovations.free)
     assert len(held)

@@ -42,5 +42,7 @@ def test_the_width_of_play_before_a_spring() -> None:
         assert mean == pytest.approx(WIDTH, abs=2.5 * sd)
         found.append((mean, sd))
     (one, narrow), (two, wide) = found
+    # Energies are right to some 0.2 nats, which moves a mean, and widens it, by some tenths of an
+    # sd. Of climbs by L-BFGS means were 2.7 of the smaller sd apart, and sds 0.004 and 0.006.
     assert one == pytest.approx(two, abs=0.5 * narrow)
     assert narrow == pytest.approx(wide, rel=0.2)

@@ -277,8 +277,9 @@ def _by_innovations(
     def innovations(potential: Potential) -> Innovations:
         return Innovations(potential, free, jacobian=True)
 
-    z, _, _ = climb(innovations(first), z, MOST_NEWTON, ridge=RIDGE)
-    here = innovations(first).local(z)
+    centre = innovations(first)
+    z, _, _ = climb(centre, z, MOST_NEWTON, ridge=RIDGE)
+    here = centre.local(z)
 
     def lowest(potential: Potential, start: np.ndarray) -> tuple[float, np.ndarray]:
         own = innovations(potential)

@@ -26,7 +26,7 @@ def along_chord(
         innovations: of a model with the sites of that one. here: of that one. steps: most of them.
         left: nats to gain at which it is.
     """
-    curvature, axes = np.linalg.eigh(here.fisher + here.prior)
+    curvature, axes = here.axes
     curvature = np.maximum(np.abs(curvature), LEAST)
     energy, gradient = innovations.beside(here, z)
     for _ in range(steps):

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -97,6 +98,12 @@ class Local:
     sd: np.ndarray
     slopes: np.ndarray
     rest: np.ndarray
+
+    @cached_property
+    def axes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Curvature (d,) of outputs and prior along axes, the columns of (d, d)."""
+        curvature, axes = np.linalg.eigh(self.fisher + self.prior)
+        return curvature, axes
 
 
 class Innovated(NamedTuple):
@@ -268,7 +275,7 @@ def climb(
         here = innovations.local(z)
         if here is None:
             return z, history, "no derivative"
-        curvature, own = np.linalg.eigh(here.fisher + here.prior)
+        curvature, own = here.axes
         curvature = np.maximum(np.abs(curvature), LEAST)
         slope = own.T @ here.gradient
         axes = np.zeros((len(z), len(own)))  # with nothing along what does not vary
