@@ -93,16 +93,23 @@ def confirm(
         for found, _ in candidates
         if id(found) not in done
     ]
-    better = _first_in_line([one for one in judged if one.helps], level)
-    playing = refits.on_one_scale(better) if better and not refits.early else []
+    while better := _first_in_line([one for one in judged if one.helps], level):
+        playing = refits.on_one_scale(better) if not refits.early else []
+        if refits.early:
+            break
+        best = _best([one for one in playing if not one.tried.failure])
+        equal = [k for k, one in enumerate(playing) if one is best or _ties(one, best, settings)]
+        winner = better[_chosen(better, playing, equal, level)]
+        fair = refits.against_refit(winner)
+        judged = [fair if one is winner else one for one in judged]
+        if fair.helps:
+            better, winner = [fair if one is winner else one for one in better], fair
+            break
     if refits.early:
         return _cut_short(candidates, judged, refits)
     if not better:
         attempts = (*(one.attempt for one in judged), *untried)
         return Confirmed(attempts, None, refits.model, None, None, None, ())
-    best = _best([one for one in playing if not one.tried.failure])
-    equal = [k for k, one in enumerate(playing) if one is best or _ties(one, best, settings)]
-    winner = better[_chosen(better, playing, equal, level)]
     name = winner.found.effect.name
     names = dict.fromkeys(better[k].found.effect.name for k in equal)
     tried = refits.with_substeps(winner)

@@ -110,11 +110,31 @@ class Refits:
         base = self.results["", kind]
         return judge(found, kind, tried, base, self.number, self.settings)
 
+    def against_refit(self, one: Judged) -> Judged:
+        """A candidate that helps, against the model without it, refitted from where it ended.
+
+        Models with functions have long ridges: whatever is added, a refit goes on along them, and
+        forecasts change by tens of nats. What the model gains without the effect is no gain of it.
+        """
+        if not self.model.has_function or not self.judged(one.found, one.kind, one.tried).helps:
+            return one  # the latter are confirmed together with another
+        trial = self.trial((self.model,), one.kind, None, base=one.tried.fit)
+        tried = self.run({"": trial}, "refits without").get("")
+        if tried is None or tried.failure:
+            return one
+        again = judge(one.found, one.kind, one.tried, tried, self.number, self.settings)
+        if again.attempt.gain >= one.attempt.gain:
+            return one
+        reason = (
+            f"{one.attempt.reason}; over the model without it, refitted, {again.attempt.reason}"
+        )
+        return replace(again, attempt=replace(again.attempt, reason=reason))
+
     def with_substeps(self, one: Judged) -> Tried:
         """What was kept of a candidate, with substeps where they are better and time is left."""
         if self.late is not None and self.late():
             return one.tried
-        return with_substeps(self.trial((one.tried.model,), one.kind, one.found), one.tried)
+        return with_substeps(self._as_kept(one, one.kind), one.tried)
 
     def on_one_scale(self, better: Sequence[Judged]) -> list[Judged]:
         """The same candidates scored alike, since gains on different densities do not compare."""
@@ -135,7 +155,7 @@ class Refits:
         Against the model without it, which is scored there, too.
         """
         trials = {
-            (repr(one.tried.model), SPREAD): self.trial((one.tried.model,), SPREAD, one.found)
+            (repr(one.tried.model), SPREAD): self._as_kept(one, SPREAD)
             for one in several
             if one.kind != SPREAD
         }
@@ -143,6 +163,10 @@ class Refits:
             base = {("", SPREAD): self.trial((self.model,), SPREAD, None)}
             self._run_new(trials | base, "refits once more")
         return {key[0]: self.results[key] for key in trials if key in self.results}
+
+    def _as_kept(self, one: Judged, kind: Kind) -> Trial:
+        """Of the variant that was kept of a candidate, with the numbers that it has."""
+        return self.trial((one.tried.model,), kind, None, base=self.current)
 
     def _run_new(self, tasks: dict[tuple[str, Kind], Trial], label: str) -> None:
         """Keep the results of trials that there are none of yet."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -187,6 +188,9 @@ def _refined(
 def _best_ahead(trial: Trial, training: Record) -> Fit:
     """The first variant, or a later one that is certainly better on the data held out.
 
+    A block that goes beyond what the training data have seen says little of a shape: of shapes that
+    forecast no worse the one is kept that is more probable given the training data.
+
     Where they differ in how they extrapolate what is right in one stretch may be luck: of those
     that are rehearsed only those count whose forecasts are no worse than those of the base held at
     its last level, or else the last one, which leaves most open. Of others the third and later ones
@@ -211,9 +215,25 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
             rated += [(fit, density(fit)) for fit in refitted(trial.models[2:])]
     best, highest = rated[0]
     for one, own in rated[1:]:
-        if certain(own - highest, settings):
+        gain = own - highest
+        as_good = trial.compared == "held out" and bool(gain.sum() >= 0.0)
+        if certain(gain, settings) or (as_good and _is_more_probable(one, best)):
             best, highest = one, own
     return best
+
+
+def _is_more_probable(one: Fit, best: Fit) -> bool:
+    """Whether training data speak for a variant, its further parameters paid for.
+
+    Source: Schwarz (Ann. Stat. 6:461, 1978), with posterior modes in place of maximum likelihood.
+    """
+    further = _parameters(one) - _parameters(best)
+    measured = sum(int((~record.missing).sum()) for record in best.records)
+    return energy(best) - energy(one) > 0.5 * further * math.log(measured)
+
+
+def _parameters(fit: Fit) -> int:
+    return sum(value.numel() for value in fit.mode.values())
 
 
 def with_substeps(trial: Trial, tried: Tried) -> Tried:

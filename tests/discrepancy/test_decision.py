@@ -320,6 +320,9 @@ def test_pairs_are_tried_where_no_structure_is_certain(
         def on_one_scale(self, better: Any) -> Any:
             return better
 
+        def against_refit(self, winner: Any) -> Any:
+            return winner
+
         def with_substeps(self, winner: Any) -> Any:
             return winner.tried
 

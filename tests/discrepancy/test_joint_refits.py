@@ -64,6 +64,9 @@ class Trials:
             for key, (models, _, name) in tasks.items()
         }
 
+    def _as_kept(self, one: Judged, kind: Any) -> Any:
+        return ((one.tried.model,), kind, one.found.effect.name)
+
     on_spread_blocks, _run_new = Refits.on_spread_blocks, Refits._run_new
 
     def candidate(self, effect: effects.Effect, q: float) -> Judged:

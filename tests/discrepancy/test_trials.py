@@ -1,6 +1,7 @@
 """Refits of extended models: what they start from, and how far they get."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -36,10 +37,13 @@ NOISE, N, TRAINING = 0.05, 320, 220
 
 @dataclass(frozen=True, eq=False)
 class Made:
-    """A fit of which only the model and its density of held-out data are asked for."""
+    """A fit of which the model, its density of held-out data and that of its own are asked for."""
 
     model: dgp.LinearDynamicGP
     level: float
+    start_energies: tuple[float, ...] = (0.0,)
+    mode: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    records: tuple[dgp.Record, ...] = ()
 
 
 @pytest.fixture(scope="module")
@@ -240,7 +244,7 @@ def test_both_functions_together_are_fitted_where_one_of_them_helps(
     made = []
 
     def again(fit, training, *, model, run):
-        made.append(Made(model, levels[len(made)]))
+        made.append(Made(model, levels[len(made)], records=(record,)))
         return made[-1]
 
     refitted_by(monkeypatch, again)
@@ -250,6 +254,38 @@ def test_both_functions_together_are_fitted_where_one_of_them_helps(
     tried = trials.run(trial)
     assert len(made) == fitted
     assert tried.model == models[kept]
+
+
+@pytest.mark.parametrize(
+    ("level", "nats", "kept"),
+    [
+        (0.5, 20.0, 1),  # 6 parameters more are worth 16.2 nats on 220 samples
+        (0.5, 15.0, 0),
+        (0.0, 20.0, 1),
+        (-0.5, 20.0, 0),  # forecasts are worse, if not certainly
+        (1.5, -99.0, 1),  # they are certainly better
+    ],
+)
+def test_of_functions_that_forecast_alike_the_more_probable_one_is_kept(
+    record, monkeypatch, level, nats, kept
+):
+    plain = dgp.LinearDynamicGP(1, pairs=1)
+    models = (with_feedback(plain), with_feedback(plain, output=False, hidden=True))
+    made = []
+
+    def again(fit, training, *, model, run):
+        more = bool(made)
+        made.append(
+            Made(model, level * more, (-nats * more,), {"x": torch.zeros(4 + 6 * more)},
+                 (record[:TRAINING],))
+        )  # fmt: skip
+        return made[-1]
+
+    refitted_by(monkeypatch, again)
+    fold = np.arange(N) >= TRAINING
+    trial = trials.Trial(models, record, (fold,), Made(plain, 0.0), 0, SETTINGS,
+                         compared="held out")  # fmt: skip
+    assert trials.run(trial).model == models[kept]
 
 
 def test_substeps_that_cannot_be_fitted_are_left(record, monkeypatch):

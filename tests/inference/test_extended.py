@@ -130,3 +130,36 @@ def test_first_starts_have_a_density(name: str) -> None:
     starts = starting_points(problem.target, problem.records, Run(0, workers=1), count=4, steps=2)
     potential = Potential(problem.target, (problem.records,), starts[0])
     assert (potential.energies_at(starts) < WALL).all()
+
+
+@pytest.mark.parametrize(
+    ("larger", "smaller"),
+    [
+        ("feedback of both", "feedback"),
+        ("feedback of both", "feedback of a hidden signal"),
+        ("feedback", "the same"),
+        ("an input", "the same"),
+        ("a dead zone", "the same"),
+        ("heavy tails", "the same"),
+    ],
+)
+def test_what_is_made_smaller_starts_at_what_is_learnt(larger: str, smaller: str) -> None:
+    """Layers keep their names: what was learnt of the output is no function of a hidden signal."""
+    linear = BASES["linear"]
+    record = made(linear)
+    quick = {"method": "map", "restarts": 1, "steps": 1, "workers": 1, "progress": False}
+    more, less = WAYS[larger](linear), WAYS[smaller](linear)
+    assert more is not None
+    assert less is not None
+    fit = dgp.fit(more, record, **quick)
+    records = less.prepare(record)
+    scaled = replace(less, scaling=records[0].scaling)
+    starts, _ = extended_starts(fit, scaled, records, 0)
+    start = starts[-1]
+    functions = [name for name in start if name.endswith("feedback_values")]
+    assert len(functions) == (smaller != "the same")
+    for name in functions:
+        assert start[name].equal(fit.mode[name])
+    assert start["g_log_decay"].equal(fit.mode["g_log_decay"])
+    potential = Potential(scaled.collapsed, (records,), start)
+    assert (potential.energies_at([start]) < WALL).all()

@@ -115,12 +115,12 @@ def _given_poles(
 def _places(base: Model, model: Model) -> dict[str, str]:
     """Names of layers in an extended model by their names in the model that it extends.
 
-    They are the same where it has them all. Else the layer more is the first one where that is a
-    function and was none before, else the last.
+    They are the same where one model has all those of the other. Else the layer more is the first
+    one where that is a function and was none before, else the last.
     """
-    names = {wire.name for wire in base.wires}
-    if names <= {wire.name for wire in model.wires}:
-        return {name: name for name in names}
+    names, there = ({wire.name for wire in one.wires} for one in (base, model))
+    if names <= there or there <= names:
+        return {name: name for name in names & there}
     first = isinstance(model.layers[0], Static) and not isinstance(base.layers[0], Static)
     skipped = len(model.layers) - len(base.layers) if first else 0
     pairs = zip(base.wires, model.wires[skipped:], strict=False)
