@@ -51,7 +51,7 @@ def free_run_of(fit: Fit, record: Record, *, seed: int, settings: LoopSettings) 
 
     if fit.method != "map":
         mean, component = run(fit)
-    elif fit.model.has_function and not fit.model.has_feedback:
+    elif fit.model.has_function:
         mean, component = _straight(run, fit, settings.draws, seed)
     else:
         mean, component = run(_spread(fit, settings.draws, seed))
@@ -182,15 +182,7 @@ def _runs(spread: Fit, past: Record, rest: Record, count: int, seed: int) -> np.
 
 
 def _spread(fit: Fit, count: int, seed: int) -> Fit:
-    """A mode with draws of what is uncertain.
-
-    With feedback each draw has a first state and functions of its own at the same parameters. They
-    are what a simulation is uncertain by (of an oscillator and a mass with friction it spreads by
-    0.147 and 0.079, with draws of parameters around the mode by 0.145 and 0.073), and such draws
-    take a climb and a Hessian of hundreds of evaluations.
-    """
-    if fit.model.has_feedback:
-        return _at_mode(fit, count)
+    """A mode with draws around it."""
     return fit.with_draws(draws_of(fit, count=count, seed=seed, anneal=False).values)
 
 
