@@ -103,7 +103,7 @@ class SearchContext:
         """Of every output, with the candidates that the model does not use."""
         taken = used_channels(fit.model)
         free = [name for name in self.names if name not in taken]
-        run = free_run_of(fit, record, seed=self.seed, settings=self.settings)
+        run = free_run_of(fit, record, held_out=held_out, seed=self.seed, settings=self.settings)
         return [
             residuals_of(
                 fit,

@@ -131,6 +131,8 @@ def _numbers(fit: Fit, group: Sequence[Channel], record: Record) -> Parameters:
             max(quantity.low, float(whole.time[0])) if quantity.inside else quantity.low,
             float(whole.time[-1]) if quantity.inside else np.inf,
             cell=_cell(fit.model, first, whole),
+            # A channel that changes at an instant is the same for all between two samples.
+            instants=whole.time if quantity.inside else None,
         )
         for field, quantity in first.numbers.items()
     ]

@@ -11,6 +11,7 @@ import numpy as np
 from pyro_dynogp.criticism.posterior_draws import draws_of, normal_near
 from pyro_dynogp.data.channels import count_direct
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.discrepancy.held_out_errors import one_step_errors
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
 from pyro_dynogp.models.delays import longest_delay, unknown_beginning
 from pyro_dynogp.models.limits import at_limits
@@ -34,14 +35,18 @@ class FreeRun:
         begin: first sample that counts: see `residuals_of`.
         mean: (n, n_y) of the fit itself [output].
         deviations: (S, n, n_y) of posterior draws, less their mean [output].
+        errors: (n, n_y) one step ahead, as of `one_step_errors`.
     """
 
     begin: int
     mean: np.ndarray
     deviations: np.ndarray
+    errors: np.ndarray
 
 
-def free_run_of(fit: Fit, record: Record, *, seed: int, settings: LoopSettings) -> FreeRun:
+def free_run_of(
+    fit: Fit, record: Record, *, held_out: np.ndarray, seed: int, settings: LoopSettings
+) -> FreeRun:
     """The free run that residuals of every output are of; see `residuals_of`."""
     prepared = fit.model.check(record)[0]
     begin = unknown_beginning(record, longest_delay(fit.model)) + settling(fit, record, settings)
@@ -57,7 +62,8 @@ def free_run_of(fit: Fit, record: Record, *, seed: int, settings: LoopSettings) 
         mean, component = run(_spread(fit, settings.draws, seed))
     chosen = np.linspace(0, len(component) - 1, min(settings.draws, len(component))).astype(int)
     drawn = component[chosen]
-    return FreeRun(begin, mean, drawn - drawn.mean(0))
+    errors = one_step_errors(fit, record, held_out)
+    return FreeRun(begin, mean, drawn - drawn.mean(0), errors)
 
 
 def _straight(
@@ -112,12 +118,13 @@ def residuals_of(
                 "candidates", expected=f"extra channels {list(record.extra)}", got=repr(name)
             )
     prepared = fit.model.check(record)[0]
+    held_out = np.ones(len(record), dtype=bool) if held_out is None else held_out
     if run is None:
-        run = free_run_of(fit, record, seed=seed, settings=settings)
+        run = free_run_of(fit, record, held_out=held_out, seed=seed, settings=settings)
     driving = prepared.n_inputs - count_direct(fit.model.channels)
     y = record.outputs[:, output].copy()
     y[: run.begin] = np.nan
-    innovations = fit.innovations(prepared)[:, output]
+    innovations = run.errors[:, output]
     # A sensor at its limit says nothing of the error there.
     stopped = at_limits(fit.model.layers, prepared)
     y[stopped], innovations = np.nan, np.where(stopped, np.nan, innovations)
@@ -131,7 +138,7 @@ def residuals_of(
         inputs=prepared.inputs[:, :driving],
         input_names=prepared.input_names[:driving],
         candidates={name: record.extra[name] for name in candidates},
-        held_out=np.ones(len(record), dtype=bool) if held_out is None else held_out,
+        held_out=held_out,
         output_name=record.output_names[output],
         output_unit=record.output_units[output],
         time_unit=record.time_unit,

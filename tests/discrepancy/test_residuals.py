@@ -228,7 +228,8 @@ def test_one_free_run_serves_every_output(sensor, monkeypatch):
     fit = dgp.fit(model, both, method="map", restarts=1, workers=1, progress=False)
     settings = LoopSettings()
     alone = [residuals.residuals_of(fit, both, output=a, settings=settings) for a in (0, 1)]
-    run = residuals.free_run_of(fit, both, seed=0, settings=settings)
+    everywhere = np.ones(len(both), dtype=bool)
+    run = residuals.free_run_of(fit, both, held_out=everywhere, seed=0, settings=settings)
     monkeypatch.setattr(residuals, "free_run_of", None)
     for a, one in enumerate(alone):
         again = residuals.residuals_of(fit, both, output=a, settings=settings, run=run)

@@ -191,3 +191,30 @@ def test_a_cell_ends_at_the_bound():
     share = 1.0 / (1.0 + np.exp(-1.0))
     assert found[0][0] == pytest.approx((1.0 - share) * 0.5)
     assert found[1][0] == pytest.approx(share * -0.5 + (1.0 - share) * 0.5)
+
+
+@pytest.mark.parametrize("strong", [4.0, 0.1])
+def test_between_two_instants_a_number_is_evaluated_once(strong):
+    """A level that steps between samples: each of these is tried once, and nothing is lost."""
+    rng = np.random.default_rng(1)
+    clock = np.cumsum(rng.uniform(0.5, 1.5, 120)) + 3.0
+    nats = strong * np.abs(clock - clock[70])
+    tried = []
+
+    def at(values):
+        tried.append(values[0])
+        return at_height(-nats[min(np.searchsorted(clock, values[0]), 119)])
+
+    options = {"low": float(clock[0]), "high": float(clock[-1])}
+    ((mean, sd),) = number_posterior(at, [Number(clock[70], 1.0, instants=clock, **options)])
+    assert set(tried) <= set(clock)
+    assert len(tried) == len(set(tried)) + 1  # the first is asked for its mode as well
+    edges, wide = clock, np.diff(clock)
+    share = np.exp(-nats[1:]) * wide
+    share /= share.sum()
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    expected = share @ middle
+    spread = np.sqrt(share @ ((middle - expected) ** 2 + wide**2 / 12.0))
+    assert mean == pytest.approx(expected, abs=0.25 * spread)
+    assert sd == pytest.approx(spread, rel=0.2)
+    assert len(tried) < (16 if strong > 1.0 else 80)

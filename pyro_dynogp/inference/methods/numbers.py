@@ -68,6 +68,14 @@ class Number:
     low: float = -np.inf
     high: float = np.inf
     cell: tuple[float, float] | None = None
+    instants: np.ndarray | None = None
+
+    def same(self, value: float) -> float:
+        """The value that stands for all that data do not tell from this one."""
+        if self.instants is None:
+            return value
+        place = min(int(np.searchsorted(self.instants, value)), len(self.instants) - 1)
+        return float(self.instants[place])
 
 
 def number_posterior(
@@ -88,7 +96,8 @@ def number_posterior(
     lowest, z = _descent(first)
     known: dict[tuple[float, ...], tuple[float, np.ndarray]] = {}
 
-    def energies(many: Sequence[tuple[float, ...]]) -> np.ndarray:
+    def energies(asked: Sequence[tuple[float, ...]]) -> np.ndarray:
+        many = [tuple(n.same(x) for n, x in zip(numbers, one, strict=True)) for one in asked]
         tasks: dict[tuple[float, ...], tuple[Potential, np.ndarray]] = {}
         for values in many:
             if values in known or values in tasks:
