@@ -30,7 +30,7 @@ LINES = 31_500
 # cascades (30 lines), heavy tails in lanes (60 lines), wider draws (30 lines), scores that
 # disagree (30 lines), numbers of models with functions by chords and Gauss-Newton (120 lines), and
 # variants that are followed, and pairs of what was kept (90 lines) came since. To shrink.
-LINES_TODAY = 52_552
+LINES_TODAY = 52_554
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

@@ -27,9 +27,10 @@ def one_step_errors(fit: Fit, record: Record, held_out: np.ndarray) -> np.ndarra
         e - sum_{s > 1} s^2 / (1 + s^2) v v^T e,    R^T J = U diag(s) V^T,    R R^T = (F + P)^-1,
 
     e the errors held out, J (D, N) their derivatives by the unconstrained vector, F the Fisher
-    matrix of what was fitted and P the curvature of the prior. (All directions would cost half of
-    what tests see: each is learnt a little better.) Errors stay as they are where they are not
-    normal: behind a function with limits, under noise that is not Gaussian.
+    matrix of what was fitted and P the curvature of the prior. (All directions would make tests
+    less powerful: each is learnt a little better.) Errors stay as they are where they are not
+    normal, behind a function with limits and under noise that is not Gaussian; and where nothing of
+    the record was fitted.
 
     Args:
         fit: to what is not held out. record: along which. held_out: (n,) True where it is.
@@ -38,7 +39,8 @@ def one_step_errors(fit: Fit, record: Record, held_out: np.ndarray) -> np.ndarra
     errors = fit.innovations(prepared)
     model = fit.model.collapsed
     normal = has_innovations(model) and model.likelihood.gaussian
-    if not (model.has_function and normal and isinstance(fit.posterior, Mixture)):
+    learns = model.has_function and normal and isinstance(fit.posterior, Mixture)
+    if not learns or held_out.all():
         return errors
     (along,) = model.prepare(where_inputs_are_known(record, longest_delay(model)))
     potential = Potential(model, ((along,),), fit.mode)

@@ -113,7 +113,7 @@ class Refits:
     def against_refit(self, one: Judged) -> Judged:
         """A candidate that helps, against the model without it, refitted from where it ended.
 
-        Models with functions have long ridges: whatever is added, a refit goes on along them, and
+        Models with functions have long ridges: whatever is added, a refit climbs along them, and
         forecasts change by tens of nats. What the model gains without the effect is no gain of it.
         """
         if not self.model.has_function or not self.judged(one.found, one.kind, one.tried).helps:

@@ -38,6 +38,7 @@ from tests.benchmarks import (
     selection,
     slow_pages,
     speed,
+    textbook,
     thresholds,
     wiener,
 )
@@ -67,6 +68,7 @@ PARTS = {
     "cascade_loo": cascade_loo.run,
     "planted": planted.run,
     "naming": naming.run,
+    "textbook": textbook.run,
     "thresholds": thresholds.run,
     "measured": measured.run,
     "loop_cost": loop_cost.run,

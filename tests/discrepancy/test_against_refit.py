@@ -1,6 +1,6 @@
 """Next to functions an effect has to gain over the model without it, refitted from where it ended.
 
-Refits go on along ridges, whatever is added.
+Refits climb along ridges, whatever is added.
 """
 
 from __future__ import annotations

@@ -91,6 +91,12 @@ def test_other_errors_stay_as_they_are(plain, model: dgp.Model) -> None:
     np.testing.assert_array_equal(errors, fit.innovations(record))
 
 
+def test_where_nothing_was_fitted_nothing_is_learnt(plain) -> None:
+    record, fit = plain
+    errors = one_step_errors(fit, record[FITTED:], np.ones(N - FITTED, dtype=bool))
+    np.testing.assert_array_equal(errors, fit.innovations(record[FITTED:]))
+
+
 def test_missing_outputs_and_dead_times_keep_their_places(plain) -> None:
     """Errors are missing where outputs are; those that are left hardly change."""
     record, fit = plain
