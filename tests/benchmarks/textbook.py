@@ -193,6 +193,9 @@ def run(folder: Path) -> str:
     seeds = [int(s) for s in os.environ.get("TEXTBOOK_SEEDS", "1,2").split(",")]
     kinds = os.environ.get("TEXTBOOK_PLANTS", ",".join(PLANTS)).split(",")
     tasks = [joblib.delayed(one)(kind, seed) for kind in kinds for seed in seeds]
-    rows = joblib.Parallel(n_jobs=-1)(tasks)
+    rows = []
+    for row in joblib.Parallel(n_jobs=-1, return_as="generator")(tasks):
+        rows.append(row)
+        print(" | ".join(row), flush=True)  # the next may take minutes
     head = ["plant", "seed", "named", "error over noise", "in 95 % bands", "outcome", "seconds"]
     return f"{(__doc__ or '').strip()}\n\n{table(head, rows)}\n"
