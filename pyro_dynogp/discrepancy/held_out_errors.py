@@ -35,8 +35,7 @@ def one_step_errors(fit: Fit, record: Record, held_out: np.ndarray) -> np.ndarra
     Args:
         fit: to what is not held out. record: along which. held_out: (n,) True where it is.
     """
-    prepared = fit.model.check(record)[0]
-    errors = fit.innovations(prepared)
+    errors = fit.innovations(record)
     model = fit.model.collapsed
     normal = has_innovations(model) and model.likelihood.gaussian
     learns = model.has_function and normal and isinstance(fit.posterior, Mixture)

@@ -17,6 +17,7 @@ from pyro_dynogp.effects.base import Compared, Score
 from pyro_dynogp.fitting import Fit
 from pyro_dynogp.inference.refit import energy, race, refit
 from pyro_dynogp.inference.run import Run
+from pyro_dynogp.inference.stability import counted
 from pyro_dynogp.models.delays import comparable, longest_delay
 from pyro_dynogp.models.variants import Model, with_usual_substeps
 from pyro_dynogp.statistics.settings import LoopSettings
@@ -227,13 +228,8 @@ def _is_more_probable(one: Fit, best: Fit) -> bool:
 
     Source: Schwarz (Ann. Stat. 6:461, 1978), with posterior modes in place of maximum likelihood.
     """
-    further = _parameters(one) - _parameters(best)
-    measured = sum(int((~record.missing).sum()) for record in best.records)
-    return energy(best) - energy(one) > 0.5 * further * math.log(measured)
-
-
-def _parameters(fit: Fit) -> int:
-    return sum(value.numel() for value in fit.mode.values())
+    (numbers, measured), (fewer, _) = counted(one), counted(best)
+    return energy(best) - energy(one) > 0.5 * (numbers - fewer) * math.log(measured)
 
 
 def with_substeps(trial: Trial, tried: Tried) -> Tried:

@@ -32,8 +32,7 @@ def of_poles(fit: Fitted) -> tuple[str, ...]:
 
 def of_numbers(fit: Fitted) -> tuple[str, ...]:
     """Whether a model with functions has nearly as many numbers as there are outputs."""
-    numbers = sum(value.numel() for value in fit.mode.values())
-    measured = sum(int((~record.missing).sum()) for record in fit.records)
+    numbers, measured = counted(fit)
     if not fit.model.has_function or numbers < CROWDED * measured:
         return ()
     return (
@@ -41,6 +40,12 @@ def of_numbers(fit: Fitted) -> tuple[str, ...]:
         "are likely to be too narrow, and forecasts to be far off: check(fit) says how forecasts "
         "hold within the record. Take fewer pairs or inducing values, or a longer record.",
     )
+
+
+def counted(fit: Fitted) -> tuple[int, int]:
+    """Free numbers of a fit, and measured outputs that it was fitted to."""
+    numbers = sum(value.numel() for value in fit.mode.values())
+    return numbers, sum(int((~record.missing).sum()) for record in fit.records)
 
 
 def is_unstable(rate: float, error: float, duration: float) -> bool:

@@ -46,11 +46,11 @@ def refits(model: Any, without: Tried | None, kind: Any) -> Any:
 
 def candidate(scored: Any, effect: effects.Effect, gain: float) -> Judged:
     result = replace(tried(gain, 10.0), fit=WITH)
-    judged: Judged = scored.judged(spoken_for(effect, 1e-5, 1e-4), kind_of_(effect), result)
+    judged: Judged = scored.judged(spoken_for(effect, 1e-5, 1e-4), scored_as(effect), result)
     return judged
 
 
-def kind_of_(effect: effects.Effect) -> Any:
+def scored_as(effect: effects.Effect) -> Any:
     return kind_of(spoken_for(effect, 1e-5, 1e-4))
 
 
@@ -66,7 +66,7 @@ def kind_of_(effect: effects.Effect) -> Any:
 def test_what_a_refit_gains_without_the_effect_is_no_gain_of_it(
     effect: effects.Effect, without: float, helps: bool, gain: float
 ) -> None:
-    scored = refits(CURVED, tried(without, 1e-9), kind_of_(effect))
+    scored = refits(CURVED, tried(without, 1e-9), scored_as(effect))
     one = candidate(scored, effect, 100.0)
     assert one.helps
     fair = scored.against_refit(one)
@@ -82,14 +82,14 @@ def test_what_a_refit_gains_without_the_effect_is_no_gain_of_it(
 
 
 def test_linear_models_have_no_ridges() -> None:
-    scored = refits(LINEAR, tried(100.0, 1e-9), kind_of_(INPUT))
+    scored = refits(LINEAR, tried(100.0, 1e-9), scored_as(INPUT))
     one = candidate(scored, INPUT, 100.0)
     assert scored.against_refit(one) is one
     assert not scored.trials
 
 
 def test_what_is_confirmed_together_with_another_is_not_judged_alone() -> None:
-    scored = refits(CURVED, tried(0.0, 1e-9), kind_of_(INPUT))
+    scored = refits(CURVED, tried(0.0, 1e-9), scored_as(INPUT))
     one = replace(candidate(scored, INPUT, -20.0), helps=True)
     assert scored.against_refit(one) is one
     assert not scored.trials
@@ -97,13 +97,13 @@ def test_what_is_confirmed_together_with_another_is_not_judged_alone() -> None:
 
 @pytest.mark.parametrize("without", [None, tried(0.0, failure="no")])
 def test_without_that_refit_the_candidate_stays_as_it_was(without: Tried | None) -> None:
-    scored = refits(CURVED, without, kind_of_(INPUT))
+    scored = refits(CURVED, without, scored_as(INPUT))
     one = candidate(scored, INPUT, 100.0)
     assert scored.against_refit(one) is one
 
 
 def test_numbers_that_were_kept_are_not_looked_for_again_on_other_blocks() -> None:
-    scored = refits(CURVED, tried(5.0), kind_of_(INPUT))
+    scored = refits(CURVED, tried(5.0), scored_as(INPUT))
     one = candidate(scored, effects.DeadTime(), 100.0)
     scored.on_spread_blocks([one])
     assert [trial.models for trial in scored.trials] == [(one.tried.model,), (CURVED,)]
@@ -116,7 +116,7 @@ def test_the_next_in_line_is_added_where_the_first_gains_nothing(
     monkeypatch: pytest.MonkeyPatch, own: float, winner: str
 ) -> None:
     """`own`: nats that the dead time gains over the refitted model."""
-    scored = refits(CURVED, None, kind_of_(INPUT))
+    scored = refits(CURVED, None, scored_as(INPUT))
     first, second = candidate(scored, effects.DeadTime(), 100.0), candidate(scored, INPUT, 60.0)
     both = [first, second]
 

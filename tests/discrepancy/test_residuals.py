@@ -19,6 +19,7 @@ from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
 from pyro_dynogp.models.variants import with_feedback
 from pyro_dynogp.prediction.predict import runs_after
 from pyro_dynogp.statistics.settings import LoopSettings
+from tests.benchmarks.textbook import plant
 from tests.prediction.test_feedback import rubbed
 
 ALONE = Run(workers=1)
@@ -242,31 +243,13 @@ def test_what_parameters_leave_next_to_feedback_is_no_effect():
 
     With deviations of the function alone two of these tests had p-values of 4e-6 and 2e-4.
     """
-    step, n, rng = 0.05, 900, np.random.default_rng(5)
-    waves, t = np.linspace(0.03, 1.2, 40), step * np.arange(1200)
-    u = np.cos(2.0 * np.pi * waves[:, None] * t + rng.uniform(0.0, 6.28, 40)[:, None]).sum(0)
-    u *= 3.0 / u.std()
-
-    def move(x, drive):
-        return np.array([x[1], drive - 9.0 * np.sin(x[0]) - 0.6 * x[1]])
-
-    states = [np.zeros(2)]
-    for drive in np.repeat(u, 5)[:-1]:
-        x, h = states[-1], step / 5
-        first = move(x, drive)
-        second = move(x + 0.5 * h * first, drive)
-        third = move(x + 0.5 * h * second, drive)
-        fourth = move(x + h * third, drive)
-        states.append(x + h / 6.0 * (first + 2.0 * second + 2.0 * third + fourth))
-    y = np.array(states)[::5, :1]
-    y = y + 0.02 * y.std() * rng.standard_normal(y.shape)
-    record = dgp.Record(t[:n], u[:n, None], y[:n])
+    record = plant("pendulum", 5)[0][:900]
     training = record[:600]
     linear = dgp.LinearDynamicGP(1, pairs=1, process_noise=False)
     base = dgp.fit(linear, training, method="map", workers=1, progress=False)
     fit = refit(base, training, model=with_feedback(linear), run=ALONE)
     settings = LoopSettings()
-    found = residuals.residuals_of(fit, record, held_out=np.arange(n) >= 600, settings=settings)
+    found = residuals.residuals_of(fit, record, held_out=np.arange(900) >= 600, settings=settings)
     tests = (effects.NonlinearFeedbackOfOutput(), effects.DeadTime(), effects.OutputNonlinearity())
     for effect in tests:
         for one in effect.detect(found, settings):

@@ -19,6 +19,7 @@ def test_a_plant_solves_its_equation() -> None:
             (0.0, step), state, rtol=1e-10, atol=1e-12,
         )  # fmt: skip
         state = solved.y[:, -1]
+    # Steps of fourth order err by 1e-8 or so.
     np.testing.assert_allclose(y[:200, 0], found, atol=1e-6)
 
 
@@ -31,4 +32,5 @@ def test_a_seed_is_a_record(kind: str) -> None:
     assert np.isfinite(record.outputs).all()
     np.testing.assert_array_equal(record.outputs, again.outputs)
     assert (record.outputs != other.outputs).any()
+    # Of the outputs without noise, which is not quite uncorrelated with them: 0.1 %.
     np.testing.assert_allclose(sd, NOISE * record.outputs.std(0), rtol=0.01)
