@@ -277,8 +277,11 @@ def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
         more = after.pairs > before.pairs or after.integrators > before.integrators
         fresh = linear_starts(target, records, None, run.seed) if more else []
         return climbed(target, [*fresh, *starts], LINEAR_STEPS)
-    if have_same_parameters(target, fit.model):  # nothing is new
-        return climbed(target, starts[:1], LAYERED_STEPS)
+    if have_same_parameters(target, fit.model):  # nothing is new but data, or substeps
+        (start, *_) = starts
+        if target.has_feedback:  # free runs may be far off there
+            start = most_probable(problem, [start, louder(start)])
+        return climbed(target, [start], LAYERED_STEPS)
     quiet = without_noise_below_functions(target)
     if quiet != target:
         best = climbed(quiet, [louder(start) for start in starts], LAYERED_STEPS)[0]

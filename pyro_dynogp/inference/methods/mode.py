@@ -212,7 +212,8 @@ def _from_all_starts(
     if learnt is not None:
         starts = [grown(learnt, starts[0]), *starts]
     steps = steps or STEPS[optimizer]
-    optima = maximise(problem.target, records, starts, run, steps=steps, optimizer=optimizer)
+    optima = maximise(problem.target, records, starts, run, steps=steps, optimizer=optimizer,
+                      learnt=int(learnt is not None))  # fmt: skip
     return _with_others_around(problem, optima, run, optimizer, steps) if model.late else optima
 
 
@@ -305,10 +306,11 @@ def climb(
         line: error of free runs of the linear model, infinite where noise is not judged.
     """
 
-    def optima_of(target: Model, points: Sequence[Values], key: str) -> list[Optimum]:
-        return maximise(
-            target, records, points, run, optimizer=optimizer, steps=steps, key=key, effort=effort
-        )
+    def optima_of(
+        target: Model, points: Sequence[Values], key: str, known: int = 0
+    ) -> list[Optimum]:
+        return maximise(target, records, points, run, optimizer=optimizer, steps=steps, key=key,
+                        effort=effort, learnt=known)  # fmt: skip
 
     quiet = without_noise_below_functions(model)
     better: list[Optimum] = []
@@ -320,7 +322,7 @@ def climb(
         starts = [grown(one.values, _faint(starts[0])) for one in better]
     elif model.has_feedback:
         starts = [louder(start) for start in starts]
-    optima = optima_of(model, [*learnt, *starts], f"{prefix}cascade")
+    optima = optima_of(model, [*learnt, *starts], f"{prefix}cascade", len(learnt))
     if not better or not (model.has_feedback or math.isfinite(line)):
         return optima
     prepared = model.prepare(records)

@@ -219,13 +219,16 @@ def maximise(
     key: str = "optimum",
     effort: Effort = EFFORT,
     held: Sequence[str] = (),
+    learnt: int = 0,
 ) -> list[Optimum]:
     """Climb from every start; the optima sorted by energy, best first.
 
     All starts get a fifth of the steps, then the best of them the rest (successive halving: a start
     that is far behind by then hardly ever wins); by Gauss-Newton in the stages of `RANKED`. The
     mode is that of the density of the constrained values (no Jacobian), as AutoDelta has it. The
-    result does not depend on the number of processors. Sites in `held` keep their values.
+    result does not depend on the number of processors. Sites in `held` keep their values. The
+    first `learnt` starts climb to the end whatever others come to: next to other data or finer
+    steps what is learnt begins low, and may end highest.
     """
     # Gauss-Newton evaluates several points by itself.
     together = 1 if optimizer == "gauss-newton" else effort.together
@@ -260,8 +263,7 @@ def maximise(
         return [optimum for batch in found for optimum in batch]
 
     def best_first(optima: list[Optimum]) -> list[Optimum]:
-        least = min(optimum.energy for optimum in optima)
-        return sorted(optima, key=lambda optimum: round(optimum.energy - least, TIED))
+        return [optima[k] for k in _order(optima)]
 
     if len(starts) == 1:
         return climb(starts, steps, "optimum", last=True)
@@ -270,18 +272,26 @@ def maximise(
     if optimizer == "gauss-newton":
         ranked = RANKED_FUNCTIONS if getattr(model, "has_function", False) else RANKED
     (first, _), *further = _stages(ranked, steps, effort.kept)
-    leading = best_first(climb(starts, first, "starts", last=not further))
+    found = climb(starts, first, "starts", last=not further)
+    order = _order(found)
     for stage, (count, kept) in enumerate(further):
-        cut = max(1, math.ceil(kept * len(leading) - 0.5))
-        leading, behind = leading[:cut], behind + leading[cut:]
+        cut = max(1, math.ceil(kept * len(order) - 0.5))
+        leading = [k for place, k in enumerate(order) if place < cut or k < learnt]
+        behind += [found[k] for k in order if k not in leading]
         label = "optima" if stage == 0 else f"optima-{stage}"
         last = stage == len(further) - 1
-        goes_on = climb([optimum.values for optimum in leading], count, label, last=last)
-        leading = best_first([
-            replace(after, history=np.concatenate([before.history, after.history]))
-            for before, after in zip(leading, goes_on, strict=True)
-        ])  # fmt: skip
-    return best_first([*leading, *behind])
+        goes_on = climb([found[k].values for k in leading], count, label, last=last)
+        for k, after in zip(leading, goes_on, strict=True):
+            history = np.concatenate([found[k].history, after.history])
+            found[k] = replace(after, history=history)
+        order = [leading[place] for place in _order([found[k] for k in leading])]
+    return best_first([*(found[k] for k in order), *behind])
+
+
+def _order(optima: Sequence[Optimum]) -> list[int]:
+    """Places of optima, those of the best first."""
+    least = min(optimum.energy for optimum in optima)
+    return sorted(range(len(optima)), key=lambda k: round(optima[k].energy - least, TIED))
 
 
 def _stages(
