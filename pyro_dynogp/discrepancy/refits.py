@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -179,12 +180,18 @@ class Refits:
         Where the residual speaks for an effect without a doubt (its false discovery rate is no more
         than `unsure`), and its gain is more than that of all that help, if short of its error, most
         of the record is held out instead, a part at a time.
+
+        So it is, where nothing helps, of what loses there, but not for certain, if it goes with
+        inputs and has no functions: its gain may be too uncertain before the block to forecast it.
+        What has functions, or goes with time, fails where it is taken beyond what it was learnt
+        from, and the last block is where that shows.
         """
         level = min(level, self.settings.unsure)
-        most = max((one.attempt.gain for one in judged if one.helps), default=0.0)
+        most = max((one.attempt.gain for one in judged if one.helps), default=-math.inf)
         unsettled = [
             one for one in judged
-            if not (one.helps or one.harms) and one.kind != SPREAD and one.attempt.gain > most
+            if not (one.helps or one.harms) and one.kind != SPREAD
+            and one.attempt.gain > (most if self._may_lose(one) else max(most, 0.0))
             and one.found.q_value <= level
         ]  # fmt: skip
         spread = self.on_spread_blocks(unsettled)
@@ -198,3 +205,9 @@ class Refits:
             return replace(kept, attempt=replace(kept.attempt, reason=reason))
 
         return [again(one) if one in unsettled else one for one in judged]
+
+    def _may_lose(self, one: Judged) -> bool:
+        """Whether a loss on the last block is neither certain nor one of a wrong shape."""
+        attempt, effect = one.attempt, one.found.effect
+        stiff = not one.tried.model.has_function and effect.acts_on == "inputs"
+        return stiff and attempt.gain > -self.settings.standard_errors * attempt.gain_error

@@ -63,7 +63,9 @@ def candidate(
     [
         (19.0, 10.0, 1e-4, True),  # nearly
         (1.0, 10.0, 1e-4, True),
-        (-1.0, 10.0, 1e-4, False),
+        (-19.0, 10.0, 1e-4, True),
+        (-30.0, 10.0, 1e-4, False),  # loses for certain
+        (-19.0, 10.0, 0.0101, False),
         (30.0, 10.0, 1e-4, False),  # helps as it is
         (19.0, 10.0, 0.0099, True),
         (19.0, 10.0, 0.0101, False),  # the residual has its doubts
@@ -100,6 +102,30 @@ def test_what_costs_forecasts_is_not_settled() -> None:
     one = candidate(INPUT, 19.0, 10.0, worse=2.0)
     assert one.harms
     assert scored.settled([one], 0.05) == [one]
+    assert not scored.asked
+
+
+@pytest.mark.parametrize(
+    ("effect", "model", "asked"),
+    [
+        (INPUT, MODEL, True),
+        (effects.Drift(), MODEL, False),
+        (effects.OutputNonlinearity(), dgp.Wiener(1, pairs=1), False),
+    ],
+)
+def test_a_loss_settles_what_goes_with_time_or_has_functions(
+    effect: effects.Effect, model: dgp.Model, asked: bool
+) -> None:
+    one, scored = candidate(effect, -5.0, 10.0), refits(WELL)
+    one = replace(one, tried=replace(one.tried, model=model))
+    scored.settled([one], 0.05)
+    assert bool(scored.asked) is asked
+
+
+def test_a_loss_is_no_candidate_beside_what_helps() -> None:
+    helps, other = candidate(DELAY, 30.0, 10.0), candidate(INPUT, -5.0, 10.0)
+    scored = refits(WELL)
+    assert scored.settled([helps, other], 0.05) == [helps, other]
     assert not scored.asked
 
 
