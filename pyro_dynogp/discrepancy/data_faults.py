@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -195,3 +195,10 @@ def _copies(record: Record, name: str, x: np.ndarray) -> Fault | None:
 
 def _times(count: int) -> str:
     return "once" if count == 1 else f"{count} times"
+
+
+def spikes_of(residuals: Sequence[Residuals], record: Record, settings: LoopSettings) -> list[str]:
+    """Spikes of the outputs, in words, also in samples that tests leave out."""
+    whole = [replace(one, output=record.outputs[:, a]) for a, one in enumerate(residuals)]
+    faults = [data_spikes(one, settings) for one in whole]
+    return [fault.sentence for fault in faults if fault is not None]

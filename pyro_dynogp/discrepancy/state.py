@@ -6,17 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.context import SearchContext, Stopwatch, Tested
-from pyro_dynogp.discrepancy.data_faults import data_spikes
+from pyro_dynogp.discrepancy.data_faults import spikes_of
 from pyro_dynogp.discrepancy.decision import LATE, Confirmed
+from pyro_dynogp.discrepancy.elimination import Added, is_superfluous, withdrawn, without
 from pyro_dynogp.discrepancy.result import Attempt, EffectTest, Outcome
 from pyro_dynogp.discrepancy.search import Candidate, Found, candidates_of, extended_by
 from pyro_dynogp.effects.base import OUTSIDE
 from pyro_dynogp.models.variants import Model, has_process_noise
 from pyro_dynogp.statistics.controllers import SET
-from pyro_dynogp.statistics.evidence import Residuals
-from pyro_dynogp.statistics.settings import LoopSettings
 
 if TYPE_CHECKING:
     from pyro_dynogp.fitting import Fit
@@ -44,8 +42,8 @@ class SearchState:
         quiet: whether process noise is taken away until it costs nothing.
         returned: whether rounds began again with it.
         number: of rounds so far.
-        accepted: effects in order. fits: with each of them and those before. seen: residuals
-            before each was added.
+        added: effects in order.
+        eliminated: names of effects that later ones have made superfluous.
         attempts: what was tried. tests: all tests, whatever came of them.
         reported: what no block mends, by the last tests.
         left: what is left, in words, by the last tests. notes: what else there is to say.
@@ -63,9 +61,8 @@ class SearchState:
     quiet: bool = False
     returned: bool = False
     number: int = 0
-    accepted: list[tuple[Found, Confirmed]] = field(default_factory=list)
-    fits: list[Fit] = field(default_factory=list)
-    seen: list[Sequence[Residuals]] = field(default_factory=list)
+    added: list[Added] = field(default_factory=list)
+    eliminated: list[str] = field(default_factory=list)
     attempts: list[Attempt] = field(default_factory=list)
     tests: list[EffectTest] = field(default_factory=list)
     reported: list[Found] = field(default_factory=list)
@@ -90,7 +87,7 @@ class SearchState:
         looked = self.look()
         if self.number == 1:
             self.notes += [
-                *_spikes(looked.residuals, self.rounds.data.known, self.rounds.settings),
+                *spikes_of(looked.residuals, self.rounds.data.known, self.rounds.settings),
                 *looked.notes,
             ]
         rounds, chosen = self.rounds, self._chosen(looked)
@@ -104,7 +101,7 @@ class SearchState:
         if confirmed is not None and confirmed.winner is not None:
             self._add(confirmed.winner, confirmed, looked)
             return True
-        if not (self.left and self.quiet) or self.accepted or self.early:
+        if not (self.left and self.quiet) or self.added or self.early:
             return False
         self.left_without = self.left
         self._go_on_from(self.first)
@@ -114,20 +111,28 @@ class SearchState:
     def go_rounds(self, most: int) -> None:
         """Go rounds until nothing helps, as many effects are added as may be, or time is over."""
         while not self.stopped() and self.go_round():
-            if len(self.accepted) == most:  # whether something is left is still to be said
+            if len(self.added) == most:  # whether something is left is still to be said
                 if not self.stopped():
                     self.number += 1
                     self._list(found := self.look().found, self._untried(found, [], OVER))
                 break
         if not self.early:
             self.doubt()
-        if self.dropped:
-            self.fits.append(self.plain)
+
+    @property
+    def accepted(self) -> list[tuple[Found, Confirmed]]:
+        """Effects that were added, in order, and what refits said of them."""
+        return [(one.found, one.confirmed) for one in self.added]
+
+    @property
+    def fits(self) -> list[Fit]:
+        """With each effect and those before; or that without process noise, which was dropped."""
+        return [self.plain] if self.dropped else [one.fit for one in self.added]
 
     @property
     def dropped(self) -> bool:
         """Whether nothing was added, and the last fit is the model without its process noise."""
-        return (self.quiet or self.returned) and not (self.accepted or self.early)
+        return (self.quiet or self.returned) and not (self.added or self.early)
 
     def stopped(self) -> bool:
         """Whether the time limit was passed before the search came to its end."""
@@ -141,7 +146,7 @@ class SearchState:
             known |= {one.name for one in self.rounds.effects if one.absorbs_structure}
         # A function of the output that is there has its limits, too.
         known |= {one.name for one in self.rounds.effects if one.special_of in known}
-        plain = None if self.accepted else self.plain
+        plain = None if self.added else self.plain
         looked = self.rounds.look(self.current, known, plain)
         # Of the last tests: what a model lacks may look like what no block mends (feedback).
         self.reported = [
@@ -154,14 +159,15 @@ class SearchState:
 
     def doubt(self) -> None:
         """Add a cause outside the catalogue as a tie, where what is left explains far more."""
-        if not (self.accepted and self.left and self._looked):
+        if not (self.added and self.left and self._looked):
             return
         beyond = self.rounds.beyond(self._looked.whole)
-        self.accepted = [
-            (winner, replace(one, ties=(*one.ties, OUTSIDE)))
-            if OUTSIDE not in one.ties and self.rounds.doubtful(winner, before, beyond)
-            else (winner, one)
-            for (winner, one), before in zip(self.accepted, self.seen, strict=True)
+        self.added = [
+            self._doubted(one)
+            if OUTSIDE not in one.confirmed.ties
+            and self.rounds.doubtful(one.found, one.seen, beyond)
+            else one
+            for one in self.added
         ]
         self.watch.stop("residual tests")
 
@@ -196,7 +202,7 @@ class SearchState:
             done = f"Nothing was found to add {ways}."
         elif self.returned:
             done = "The search without it found nothing to add, and began again with it."
-        elif not self.accepted:
+        elif not self.added:
             done = "The search began without it."
         else:
             back = has_process_noise(self.current.model)
@@ -280,28 +286,45 @@ class SearchState:
         """Go on with the model that a winner extends."""
         rounds, larger = self.rounds, confirmed.model
         assert larger is not None
-        if rounds.doubtful(winner, looked.whole, rounds.beyond(looked.residuals)):
-            confirmed = replace(confirmed, ties=(*confirmed.ties, OUTSIDE))
-        self.accepted.append((winner, confirmed))
-        self.seen.append(looked.whole)
+        base = self.current
         self.watch.stop("residual tests")
         again = rounds.hold_out_less(winner)
         fit = confirmed.fit
         if fit is None or again:
-            fit = rounds.refit(self.current, larger)
+            fit = rounds.refit(base, larger)
         if self.quiet and (noisy := rounds.with_process_noise(fit)) is not None:
             fit, self.quiet = noisy, False
-        self._go_on_from(fit)
-        self.fits.append(fit)
+        one = Added(winner, confirmed, looked.whole, base, fit)
+        if rounds.doubtful(winner, looked.whole, rounds.beyond(looked.residuals)):
+            one = self._doubted(one)
+        self.added.append(one)
+        self._eliminate()
+        self._go_on_from(self.added[-1].fit)
         self.watch.stop("refits")
+
+    @staticmethod
+    def _doubted(one: Added) -> Added:
+        """With a cause outside the catalogue as a tie."""
+        return replace(one, confirmed=replace(one.confirmed, ties=(*one.confirmed.ties, OUTSIDE)))
+
+    def _eliminate(self) -> None:
+        """Take out what the effect added last has made superfluous, each kind of effect once."""
+        rounds, last = self.rounds, self.added[-1].found.effect.name
+        for one in self.added[-2::-1]:
+            name = one.found.effect.name
+            if name in self.eliminated or self.stopped():
+                continue
+            left = without(self.added, self.added.index(one), rounds.refit)
+            if left is None or not is_superfluous(
+                one, self.added[-1].fit, left[-1].fit, rounds.data.known, rounds.held_out,
+                rounds.settings,
+            ):  # fmt: skip
+                continue
+            self.added = left
+            self.eliminated.append(name)
+            self.attempts, self.tests = withdrawn(self.attempts, self.tests, one, last)
+            self.notes.append(f"{name} is superfluous next to {last}, and was taken out again.")
 
     def _go_on_from(self, fit: Fit) -> None:
         self.current, self.model = fit, replace(fit.model, scaling=None)
         self.left, self._looked, self._omnibus = (), None, ()  # they were of another model
-
-
-def _spikes(residuals: Sequence[Residuals], record: Record, settings: LoopSettings) -> list[str]:
-    """Spikes of the outputs, in words, also in samples that tests leave out."""
-    whole = [replace(one, output=record.outputs[:, a]) for a, one in enumerate(residuals)]
-    faults = [data_spikes(one, settings) for one in whole]
-    return [fault.sentence for fault in faults if fault is not None]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,7 +16,7 @@ from pyro_dynogp.effects.base import Compared, Score
 from pyro_dynogp.fitting import Fit
 from pyro_dynogp.inference.refit import energy, race, refit
 from pyro_dynogp.inference.run import Run
-from pyro_dynogp.inference.stability import counted
+from pyro_dynogp.inference.stability import log_bayes_factor
 from pyro_dynogp.models.delays import comparable, longest_delay
 from pyro_dynogp.models.variants import Model, with_usual_substeps
 from pyro_dynogp.statistics.settings import LoopSettings
@@ -26,6 +25,8 @@ from pyro_dynogp.statistics.settings import LoopSettings
 MOVES = 4
 # A signal that varies by no more than this share of its size is constant, as for a fit.
 CONSTANT = 1e-12
+# Log Bayes factor from which on evidence is very strong (Kass & Raftery, JASA 90:773, 1995) [nats].
+VERY_STRONG = 5.0
 
 
 @dataclass(frozen=True)
@@ -217,19 +218,23 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
     best, highest = rated[0]
     for one, own in rated[1:]:
         gain = own - highest
-        as_good = trial.compared == "held out" and bool(gain.sum() >= 0.0)
-        if certain(gain, settings) or (as_good and _is_more_probable(one, best)):
+        shape = trial.compared == "held out"
+        if certain(gain, settings) or (shape and _is_more_probable(one, best, gain, settings)):
             best, highest = one, own
     return best
 
 
-def _is_more_probable(one: Fit, best: Fit) -> bool:
+def _is_more_probable(one: Fit, best: Fit, gain: np.ndarray, settings: LoopSettings) -> bool:
     """Whether training data speak for a variant, its further parameters paid for.
 
-    Source: Schwarz (Ann. Stat. 6:461, 1978), with posterior modes in place of maximum likelihood.
+    Held-out data may not speak against it: neither with certainty, nor so much that little is left
+    of the evidence of both. By how little held-out data differ is a matter of rounding.
+
+    Args:
+        gain: of its log-density on held-out data [nats].
     """
-    (numbers, measured), (fewer, _) = counted(one), counted(best)
-    return energy(best) - energy(one) > 0.5 * (numbers - fewer) * math.log(measured)
+    together = log_bayes_factor(one, best) + min(float(gain.sum()), 0.0)
+    return together > VERY_STRONG and not certain(-gain, settings)
 
 
 def with_substeps(trial: Trial, tried: Tried) -> Tried:

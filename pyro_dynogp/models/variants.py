@@ -67,6 +67,24 @@ def with_channels_of(model: Model, other: Model, base: Model) -> Model | None:
     return model if added and same == other else None
 
 
+def without_channels_of(model: Model, other: Model, base: Model) -> Model | None:
+    """The model without the channels that another one adds to a base.
+
+    None where that one adds none or differs in more than them, and where the model lacks one of
+    them, or has another that is made from it.
+    """
+    added = [channel for channel in other.channels if channel not in base.channels]
+    made = {name for channel in added for name in channel.names}
+    kept = [channel for channel in model.channels if channel not in added]
+    if len(model.channels) - len(kept) < len(added):
+        return None
+    if made & {value for one in kept for value in vars(one).values() if isinstance(value, str)}:
+        return None
+    for channel in added:
+        other, model = without_channel(other, channel), without_channel(model, channel)
+    return model if added and other == base else None
+
+
 def with_dynamics(model: Model, change: Callable[[Wire, Dynamic], Dynamic]) -> Model:
     """The model with other dynamic layers."""
     layers = tuple(

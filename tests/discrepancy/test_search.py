@@ -111,6 +111,10 @@ def state():
     return SearchState(context, Stopwatch(), first)
 
 
+def added(found: Found) -> SimpleNamespace:
+    return SimpleNamespace(found=found, confirmed=SimpleNamespace(ties=()))
+
+
 def test_a_function_of_the_output_has_its_limits_too(state, monkeypatch):
     """A special case is not looked for again in a model that has the general effect."""
     seen = {}
@@ -122,15 +126,13 @@ def test_a_function_of_the_output_has_its_limits_too(state, monkeypatch):
     monkeypatch.setattr(SearchContext, "look", look_)
     monkeypatch.setattr(SearchContext, "left", lambda self, looked: ((), ()))
     general = Found(*speaking(effects.OutputNonlinearity(), 1e-9), 1e-8)
-    state.accepted = [(general, SimpleNamespace(ties=()))]
+    state.added = [added(general)]
     state.look()
     assert seen["known"] == {"output nonlinearity", "saturation"}
-    state.accepted = [
-        (Found(*speaking(effects.LevelShift(), 1e-9), 1e-8), SimpleNamespace(ties=()))
-    ]
+    state.added = [added(Found(*speaking(effects.LevelShift(), 1e-9), 1e-8))]
     state.look()
     assert seen["known"] == {"level shift"}
-    state.accepted = []
+    state.added = []
 
 
 def test_what_inputs_under_feedback_may_imitate_is_not_tried_where_feedback_is_more_certain(state):

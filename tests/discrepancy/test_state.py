@@ -223,7 +223,7 @@ def test_what_was_done_about_noise_that_hides_is_said(noise, accepted, returned,
         SimpleNamespace(model=MODEL if one else without_process_noise(MODEL)) for one in noise
     )
     course = SimpleNamespace(
-        hidden="forecasts better", first=first, current=current, accepted=accepted,
+        hidden="forecasts better", first=first, current=current, added=accepted,
         returned=returned, dropped=dropped,
     )  # fmt: skip
     (sentence,) = SearchState.said_of_hiding(course)

@@ -259,10 +259,12 @@ def test_both_functions_together_are_fitted_where_one_of_them_helps(
 @pytest.mark.parametrize(
     ("level", "nats", "kept"),
     [
-        (0.5, 20.0, 1),  # 6 parameters more are worth 16.2 nats on 220 samples
-        (0.5, 15.0, 0),
-        (0.0, 20.0, 1),
-        (-0.5, 20.0, 0),  # forecasts are worse, if not certainly
+        (0.5, 22.0, 1),  # 6 parameters more are worth 16.2 nats on 220 samples
+        (0.5, 21.0, 0),  # what is left is less than very strong evidence
+        (0.0, 22.0, 1),
+        (-0.5, 22.0, 1),  # forecasts are worse, if not certainly
+        (-0.9, 22.0, 0),  # together they are no very strong evidence
+        (-1.5, 99.0, 0),  # forecasts are certainly worse
         (1.5, -99.0, 1),  # they are certainly better
     ],
 )
