@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Sequence
 
 import numpy as np
@@ -41,16 +40,28 @@ def lasting(
     training = without(record, fold)
     later = last_half(training)
     half = training[: int(np.argmax(later))]
-    with contextlib.suppress(ValueError):  # a half in which an input never moves says nothing
+    try:
         held = held_errors(refit(base, half, model=base.model, run=run), training, later, settings)
-        kept = [
-            fit for fit in kept
-            if not is_worse(
-                forecast_errors(refit(fit, half, model=fit.model, run=run), training, later)[0],
-                held, settings,
-            )
-        ]  # fmt: skip
-    return kept
+    except ValueError:  # a half in which an input never moves says nothing
+        return kept
+    return [fit for fit in kept if _lasts(fit, half, training, later, held, run, settings)]
+
+
+def _lasts(
+    fit: Fit,
+    half: Record,
+    training: Record,
+    later: np.ndarray,
+    held: np.ndarray,
+    run: Run,
+    settings: LoopSettings,
+) -> bool:
+    """Whether an extended model that is fitted to a half forecasts the other one no worse."""
+    try:
+        again = refit(fit, half, model=fit.model, run=run)
+    except ValueError:  # nor does one in which a ramp has not begun
+        return True
+    return not is_worse(forecast_errors(again, training, later)[0], held, settings)
 
 
 def last_half(record: Record) -> np.ndarray:

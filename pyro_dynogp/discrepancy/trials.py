@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from pyro_dynogp.data.channels import prepared
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.held_out import certain, held_out_density, scored, without
 from pyro_dynogp.discrepancy.rehearsal import lasting
@@ -124,8 +125,8 @@ def why_not(trial: Trial, error: ValueError) -> str:
             reasons.append(f"the model has {twice!r} already")
             continue
         training = without(trial.record, fold)
-        for channel in model.channels:
-            columns = channel.columns(training)
+        for place, channel in enumerate(model.channels):
+            columns = channel.columns(prepared(training, model.channels[:place]))
             for name, x in zip(channel.names, columns.T, strict=True):
                 if np.ptp(x) <= CONSTANT * np.abs(x).max():
                     reasons.append(f"{name!r} is constant on the {where}")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
 from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
 
-from pyro_dynogp.data.channels import Trend, TrendOfGain
+from pyro_dynogp.data.channels import Ramp, RampOfGain, Trend, TrendOfGain
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.effects.base import Effect, centre_of
 from pyro_dynogp.models.variants import Model, with_channel, with_pairs, with_process_noise
@@ -21,6 +23,9 @@ from pyro_dynogp.statistics.shares_of_inputs import paths
 SLOW = ((1,), (1, 2), (1, 2, 3, 4))
 # Inputs beyond which a drift of gain is looked for in the mean as a whole only.
 INPUTS = 4
+# Ramps of a path of gain, and the share of the record at which the last one ends: the path begins
+# in what a search trains on, two thirds of what it knows, and is held from there.
+RAMPS, LAST = 4, 2 / 3
 
 
 def drift(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> Evidence:
@@ -92,20 +97,36 @@ class Drift(Effect):
     test = staticmethod(drift)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
-        """A straight line in time, or a random path; or each input times a line.
+        """A straight line in time, or a random path; or each input times a line, or times ramps.
 
-        The random path is a pair of poles, as slow as suits it, that process noise drives. What is
-        nearly straight so far need not go on so: held-out data say whether it does.
+        The random path is a pair of poles, as slow as suits it, that process noise drives. Ramps
+        make a path of gain that is held where the last one ends. A gain that drifts moves the level
+        as well, unless the input is at its zero on average: there are variants with and without.
+        What is nearly straight so far need not go on so: held-out data say whether it does.
         """
         begin, end = float(record.time[0]), float(record.time[-1])
         if evidence.where["form"] == "additive":
             path = with_process_noise(with_pairs(model, 1))
             return [with_channel(model, Trend(begin, end)), path]
-        extended = model
+        drifting = [one for one in model.channels if isinstance(one, (TrendOfGain, RampOfGain))]
+        made = {name for one in drifting for name in one.names}
         prepared = model.check(record)[0]
-        driving = prepared.n_inputs - model.direct
-        for name in prepared.input_names[:driving]:
-            extended = with_channel(
-                extended, TrendOfGain(name, centre_of(prepared, name), begin, end)
-            )
-        return [extended]
+        driving = prepared.input_names[: prepared.n_inputs - model.direct]
+        centres = {name: centre_of(prepared, name) for name in driving if name not in made}
+        last = begin + LAST * (end - begin)
+        ramps = list(itertools.pairwise(np.linspace(begin, last, RAMPS + 1).tolist()))
+        lines = [TrendOfGain(name, at, begin, end) for name, at in centres.items()]
+        paths = [RampOfGain(name, at, *ends) for name, at in centres.items() for ends in ramps]
+        variants = (
+            lines,
+            [*lines, Trend(begin, end)],
+            paths,
+            [*paths, *(Ramp(*ends) for ends in ramps)],
+        )
+        # A gain that drifts already has what it has not had.
+        kinds = {type(one) for one in model.channels}
+        return [
+            functools.reduce(with_channel, channels, model)
+            for channels in variants
+            if not kinds & {type(one) for one in channels}
+        ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 
 import numpy as np
@@ -41,6 +42,8 @@ ALL = [
     channels.TrendOfGain("load", 0.0, 0.0, 10.0),
     channels.Sinusoid(4.0, 2),
     channels.ShiftedClock("load", 1.0, (10.0, 20.0)),
+    channels.Ramp(5.0, 12.0),
+    channels.RampOfGain("load", 0.1, 5.0, 12.0),
 ]
 
 
@@ -119,6 +122,18 @@ def test_play_stays_within_its_width_and_moves_only_at_its_edges(width: float, s
     moved = np.flatnonzero(np.diff(y) != 0) + 1
     np.testing.assert_allclose(np.abs(u - y)[moved], 0.5 * width, atol=1e-9)
     np.testing.assert_allclose(play(u, 0.0), u)
+
+
+def test_ramps_make_a_path_that_is_held() -> None:
+    """With their gains they go through the knots, and stay where the last one ends."""
+    own, knots, levels = record(), [0.0, 8.0, 16.0, 24.0], np.array([0.0, -1.0, 0.5, 2.0])
+    pairs = list(itertools.pairwise(knots))
+    level = np.interp(own.time, knots, levels)
+    ramps = np.column_stack([channels.Ramp(*ends).columns(own)[:, 0] for ends in pairs])
+    np.testing.assert_allclose(ramps @ np.diff(levels), level, atol=1e-12)
+    gains = [channels.RampOfGain("load", 0.1, *ends).columns(own)[:, 0] for ends in pairs]
+    expected = (own.inputs[:, 1] - 0.1) * level
+    np.testing.assert_allclose(np.column_stack(gains) @ np.diff(levels), expected, atol=1e-12)
 
 
 def test_a_dead_zone_leaves_what_lies_beyond() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 import pyro_dynogp as dgp
 from pyro_dynogp import effects
-from pyro_dynogp.data.channels import Delayed, Recorded, Step, Trend
+from pyro_dynogp.data.channels import Delayed, Play, Recorded, Step, Trend
 from pyro_dynogp.discrepancy import trials
 from pyro_dynogp.discrepancy.held_out import forecast_errors, held_out_density
 from pyro_dynogp.discrepancy.search import candidates_of
@@ -140,6 +140,14 @@ def test_a_function_more_is_climbed_from_linear_fits_of_its_own_too():
     [
         ((Recorded("still"),), "'still' is constant on the training block"),
         ((Step(25.0),), "'step at 25' is constant on the training block"),
+        (
+            (
+                Delayed("u", 0.2),
+                Play("u delayed", 0.4),
+                Recorded("still"),
+            ),  # one is made of another
+            "'still' is constant on the training block",
+        ),
         ((Trend(0.0, 30.0), Trend(0.0, 30.0)), "the model has 'trend' already"),
     ],
 )

@@ -7,14 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 import pyro_dynogp as dgp
 from pyro_dynogp import effects
+from pyro_dynogp.data.channels import Ramp, RampOfGain
 from pyro_dynogp.discrepancy import rehearsal
 from pyro_dynogp.discrepancy.rehearsal import held_errors, is_worse, last_half, lasting
 from pyro_dynogp.discrepancy.trials import Trial, run
 from pyro_dynogp.inference.refit import refit
 from pyro_dynogp.inference.run import Run
+from pyro_dynogp.models.variants import with_channel
 from pyro_dynogp.statistics.evidence import Evidence
 from pyro_dynogp.statistics.settings import LoopSettings
 from tests.discrepancy.made import SETTINGS
@@ -106,3 +109,35 @@ def test_a_first_half_that_cannot_be_fitted_says_nothing(monkeypatch):
 
     monkeypatch.setattr(rehearsal, "refit", refused)
     assert lasting(fits, base, record, np.arange(KNOWN) >= A, RUN, SETTINGS) == fits
+
+
+def test_a_path_that_has_not_begun_in_the_first_half_says_nothing_and_others_are_rehearsed():
+    """The level rises in the second half of the training data alone, and stays."""
+    record = with_level(np.interp(np.arange(N), [A // 2 + 9, A - 20], [0.0, 1.0]))[:KNOWN]
+    base = fitted(record)
+    own = replace(base.model, scaling=None)
+    late = with_channel(own, Ramp(float(record.time[A // 2 + 9]), float(record.time[A - 20])))
+    fits = [refit(base, record[:A], model=m, run=RUN) for m in (variants(record, base)[0], late)]
+    assert lasting(fits, base, record, np.arange(KNOWN) >= A, RUN, SETTINGS) == fits[1:]
+
+
+def test_a_gain_that_falls_and_stays_is_a_path():
+    """A line goes on falling."""
+    rng = np.random.default_rng(6)
+    u = np.repeat(rng.standard_normal(N // 6), 6) + 1.0
+    gain = np.interp(np.arange(N), [0, 80, 200], [1.0, 0.9, 0.5])
+    y = lfilter([0, 0.3], [1, -0.7], gain * u) + 0.02 * rng.standard_normal(N)
+    record = dgp.Record(np.arange(N) * 0.5, u, y)
+    report = dgp.close_loop(
+        fitted(record), record, effects=(effects.Drift(), effects.LevelShift()), workers=1,
+        progress=False,
+    )  # fmt: skip
+    assert [one.name for one in report.effects] == ["drift"]
+    channels = report.fit.model.channels
+    assert {type(one) for one in channels} == {RampOfGain, Ramp}
+    gains = [one for one in channels if isinstance(one, RampOfGain)]
+    fallen = {k: v for k, v in report.effects[0].parameters.items() if "times ramp" in k}
+    assert len(fallen) == len(gains) == 4
+    assert sum(mean for mean, _ in fallen.values()) == pytest.approx(-0.5, abs=0.03)
+    assert report.before["rmse"] > 3.0 * report.after["rmse"]
+    assert report.after["rmse"] < 1.15 * 0.02  # the noise

@@ -9,6 +9,8 @@ are on the clock of the training record, which parts of one record share.
 from pyro_dynogp.data.channels.base import Channel, Quantity
 from pyro_dynogp.data.channels.clock import (
     Calendar,
+    Ramp,
+    RampOfGain,
     ShiftedClock,
     Sinusoid,
     Step,
@@ -33,6 +35,8 @@ __all__ = [
     "Play",
     "Product",
     "Quantity",
+    "Ramp",
+    "RampOfGain",
     "Recorded",
     "ShiftedClock",
     "Sinusoid",

@@ -74,6 +74,52 @@ class TrendOfGain(Channel):
 
 
 @dataclass(frozen=True)
+class Ramp(Channel):
+    """Zero until `begin`, one from `end` on [time unit], a straight line between them.
+
+    Several make a path of the output's level.
+    """
+
+    direct: ClassVar[bool] = True
+    begin: float
+    end: float
+
+    def _names(self) -> tuple[str, ...]:
+        return (f"ramp {self.begin:.6g} to {self.end:.6g}",)
+
+    def _columns(self, record: Record) -> np.ndarray:
+        return np.clip((record.time - self.begin) / (self.end - self.begin), 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class RampOfGain(Channel):
+    """An input times a `Ramp`. Several make a path of a gain.
+
+    Args:
+        channel: name of the input. centre: subtracted from it first [input].
+        begin, end: [time unit].
+
+    Examples:
+        >>> from pyro_dynogp.data.channels import RampOfGain
+        >>> record = dgp.Record([0.0, 1.0, 2.0, 3.0], [3.0, 3.0, 3.0, 3.0], [0.0, 1.0, 1.0, 2.0])
+        >>> RampOfGain("u", 1.0, 0.0, 2.0).columns(record)[:, 0]
+        array([0., 1., 2., 2.])
+    """
+
+    channel: str
+    centre: float
+    begin: float
+    end: float
+
+    def _names(self) -> tuple[str, ...]:
+        return (f"{self.channel} times ramp {self.begin:.6g} to {self.end:.6g}",)
+
+    def _columns(self, record: Record) -> np.ndarray:
+        ramp = Ramp(self.begin, self.end).columns(record)[:, 0]
+        return (signal_of(record, self.channel) - self.centre) * ramp
+
+
+@dataclass(frozen=True)
 class Sinusoid(Channel):
     """Cosine and sine of a known period [time unit] and of its harmonics."""
 

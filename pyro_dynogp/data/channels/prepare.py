@@ -12,6 +12,8 @@ import numpy as np
 from pyro_dynogp.data.channels.base import Channel
 from pyro_dynogp.data.channels.clock import (
     Calendar,
+    Ramp,
+    RampOfGain,
     ShiftedClock,
     Sinusoid,
     Step,
@@ -26,7 +28,7 @@ KINDS: dict[str, type[Channel]] = {
     kind.__name__: kind
     for kind in (
         Recorded, Delayed, DeadZone, Play, Transformed, Product, Step, Trend, TrendOfGain,
-        Sinusoid, Calendar, ShiftedClock,
+        Ramp, RampOfGain, Sinusoid, Calendar, ShiftedClock,
     )
 }  # fmt: skip
 
