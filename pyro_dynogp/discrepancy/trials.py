@@ -28,6 +28,9 @@ MOVES = 4
 CONSTANT = 1e-12
 # Log Bayes factor from which on evidence is very strong (Kass & Raftery, JASA 90:773, 1995) [nats].
 VERY_STRONG = 5.0
+# Errors of forecasts are noise alone up to so many of its standard deviations: parameters learnt
+# from a few hundred samples add some percent, and so many errors tell their size to four.
+NOISE_ALONE = 1.1
 
 
 @dataclass(frozen=True)
@@ -198,31 +201,42 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
     that are rehearsed only those count whose forecasts are no worse than those of the base held at
     its last level, or else the last one, which leaves most open. Of others the third and later ones
     join what the first two are, and take most of the time: where neither of these forecasts better
-    than the base they are not fitted.
+    than the base, or one leaves nothing but noise, they are not fitted.
     """
     fold, settings = trial.folds[0], trial.settings
 
     def refitted(models: Sequence[Model]) -> list[Fit]:
         return [refit(trial.base, training, model=model, run=trial.run) for model in models]
 
-    def density(fit: Fit) -> np.ndarray:
-        return held_out_density(fit, trial.record, fold, trial.score)
+    def rated(models: Sequence[Model]) -> list[tuple[Fit, np.ndarray, np.ndarray]]:
+        return [(fit, *scored(fit, trial.record, fold, trial.score)) for fit in refitted(models)]
 
     if trial.compared == "rehearsed":
         fits = refitted(trial.models)
         fits = lasting(fits, trial.base, trial.record, fold, trial.run, settings) or fits[-1:]
-        rated = [(fit, density(fit)) for fit in fits]
+        found = [(fit, *scored(fit, trial.record, fold, trial.score)) for fit in fits]
     else:
-        rated = [(fit, density(fit)) for fit in refitted(trial.models[:2])]
-        if trial.models[2:] and max(own.sum() for _, own in rated) > density(trial.base).sum():
-            rated += [(fit, density(fit)) for fit in refitted(trial.models[2:])]
-    best, highest = rated[0]
-    for one, own in rated[1:]:
+        found = rated(trial.models[:2])
+        leading, most, errors = max(found, key=lambda one: float(one[1].sum()))
+        if trial.models[2:] and not _are_noise(errors, leading):
+            least = held_out_density(trial.base, trial.record, fold, trial.score)
+            if most.sum() > least.sum():
+                found += rated(trial.models[2:])
+    best, highest, _ = found[0]
+    for one, own, _ in found[1:]:
         gain = own - highest
         shape = trial.compared == "held out"
         if certain(gain, settings) or (shape and _is_more_probable(one, best, gain, settings)):
             best, highest = one, own
     return best
+
+
+def _are_noise(errors: np.ndarray, fit: Fit) -> bool:
+    """Whether errors (M, n_y) of forecasts are no larger than the noise that a fit has learnt."""
+    if fit.system.noise.constant_sd is None:  # its size varies
+        return False
+    rmse = np.sqrt(np.nanmean(np.square(errors), axis=0))
+    return bool((rmse <= NOISE_ALONE * fit.noise_sd).all())
 
 
 def _is_more_probable(one: Fit, best: Fit, gain: np.ndarray, settings: LoopSettings) -> bool:

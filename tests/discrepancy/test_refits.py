@@ -145,7 +145,7 @@ def test_a_function_more_is_climbed_from_linear_fits_of_its_own_too():
                 Delayed("u", 0.2),
                 Play("u delayed", 0.4),
                 Recorded("still"),
-            ),  # one is made of another
+            ),
             "'still' is constant on the training block",
         ),
         ((Trend(0.0, 30.0), Trend(0.0, 30.0)), "the model has 'trend' already"),

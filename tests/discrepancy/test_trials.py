@@ -174,8 +174,11 @@ def test_models_without_process_noise_stay_as_they_are():
     assert not without_process_noise(dgp.LinearDynamicGP(1)).layers[0].process_noise
 
 
-def refitted_by(monkeypatch, again):
-    """Refits are made by `again`, and gain their level in nine samples; certain is one nat."""
+def refitted_by(monkeypatch, again, noise=False):
+    """Refits are made by `again`, and gain their level in nine samples; certain is one nat.
+
+    Their errors of forecasts are noise alone, or not.
+    """
 
     def density(fit, *_):
         return np.full(9, fit.level / 9)
@@ -183,6 +186,7 @@ def refitted_by(monkeypatch, again):
     monkeypatch.setattr(trials, "refit", again)
     monkeypatch.setattr(trials, "held_out_density", density)
     monkeypatch.setattr(trials, "scored", lambda fit, *_: (density(fit), np.zeros((9, 1))))
+    monkeypatch.setattr(trials, "_are_noise", lambda errors, fit: noise)
     monkeypatch.setattr(trials, "certain", lambda gain, settings: gain.sum() > 1.0)
 
 
@@ -226,17 +230,19 @@ def test_a_step_has_substeps_where_they_are_better(record, monkeypatch, gains, h
 
 
 @pytest.mark.parametrize(
-    ("levels", "fitted", "kept"),
+    ("levels", "noise", "fitted", "kept"),
     [
-        ((5.0, -3.0, 9.0), 3, 2),
-        ((-3.0, 0.5, 9.0), 3, 2),
-        ((-3.0, 0.5, 1.0), 3, 1),  # certain is more than one nat
-        ((-3.0, -1.5, 9.0), 2, 1),  # neither forecasts better than the base
-        ((-1.0, 0.0, 9.0), 2, 0),
+        ((5.0, -3.0, 9.0), False, 3, 2),
+        ((-3.0, 0.5, 9.0), False, 3, 2),
+        ((-3.0, 0.5, 1.0), False, 3, 1),  # certain is more than one nat
+        ((-3.0, -1.5, 9.0), False, 2, 1),  # neither forecasts better than the base
+        ((-1.0, 0.0, 9.0), False, 2, 0),
+        ((5.0, -3.0, 9.0), True, 2, 0),  # one leaves nothing to explain
+        ((-3.0, 0.5, 9.0), True, 2, 1),
     ],
 )
-def test_both_functions_together_are_fitted_where_one_of_them_helps(
-    record, monkeypatch, levels, fitted, kept
+def test_both_functions_together_are_fitted_where_one_of_them_helps_and_leaves_something(
+    record, monkeypatch, levels, noise, fitted, kept
 ):
     plain = dgp.LinearDynamicGP(1, pairs=1)
     models = (with_feedback(plain), with_feedback(plain, output=False, hidden=True),
@@ -247,13 +253,25 @@ def test_both_functions_together_are_fitted_where_one_of_them_helps(
         made.append(Made(model, levels[len(made)], records=(record,)))
         return made[-1]
 
-    refitted_by(monkeypatch, again)
+    refitted_by(monkeypatch, again, noise)
     fold = np.arange(N) >= TRAINING
     trial = trials.Trial(models, record, (fold,), Made(plain, 0.0), 0, SETTINGS,
                          compared="held out")  # fmt: skip
     tried = trials.run(trial)
     assert len(made) == fitted
     assert tried.model == models[kept]
+
+
+@pytest.mark.parametrize(
+    ("ratios", "noise"), [((1.09, 1.0), True), ((1.11, 1.0), False), ((1.0, 1.11), False)]
+)
+def test_errors_are_noise_up_to_a_tenth_more_in_every_output(ratios, noise):
+    sd = np.array([0.5, 20.0])
+    errors = np.resize([1.0, -1.0, np.nan], (30, 1)) * sd * ratios
+    fit = SimpleNamespace(noise_sd=sd, system=SimpleNamespace(noise=SimpleNamespace(constant_sd=1)))
+    assert trials._are_noise(errors, fit) == noise
+    fit.system.noise.constant_sd = None  # it varies, and has no one size
+    assert not trials._are_noise(errors, fit)
 
 
 @pytest.mark.parametrize(
