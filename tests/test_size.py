@@ -33,7 +33,7 @@ LINES = 31_500
 # learn from and gains over refits (130 lines) came since, and effects that are taken out again
 # (170 lines), paths of gain (90 lines), climbs that go on and losses that are settled (40 lines).
 # To shrink.
-LINES_TODAY = 52_854
+LINES_TODAY = 52_857
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()
