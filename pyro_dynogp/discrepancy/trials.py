@@ -212,7 +212,7 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
         return [(fit, *scored(fit, trial.record, fold, trial.score)) for fit in refitted(models)]
 
     if trial.compared == "rehearsed":
-        fits = refitted(trial.models)
+        fits = _fitted(trial, training)
         fits = lasting(fits, trial.base, trial.record, fold, trial.run, settings) or fits[-1:]
         found = [(fit, *scored(fit, trial.record, fold, trial.score)) for fit in fits]
     else:
@@ -229,6 +229,23 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
         if certain(gain, settings) or (shape and _is_more_probable(one, best, gain, settings)):
             best, highest = one, own
     return best
+
+
+def _fitted(trial: Trial, training: Record) -> list[Fit]:
+    """Fits of all variants but those that the training data say nothing of, as a later ramp.
+
+    Raises:
+        ValueError: where none can be fitted.
+    """
+    fits, problems = [], []
+    for model in trial.models:
+        try:
+            fits.append(refit(trial.base, training, model=model, run=trial.run))
+        except ValueError as error:
+            problems.append(error)
+    if not fits:
+        raise problems[0]
+    return fits
 
 
 def _are_noise(errors: np.ndarray, fit: Fit) -> bool:

@@ -141,3 +141,15 @@ def test_a_gain_that_falls_and_stays_is_a_path():
     assert sum(mean for mean, _ in fallen.values()) == pytest.approx(-0.5, abs=0.03)
     assert report.before["rmse"] > 3.0 * report.after["rmse"]
     assert report.after["rmse"] < 1.15 * 0.02  # the noise
+
+
+def test_variants_that_begin_after_the_training_data_are_passed_over():
+    record = with_level(np.arange(N) / N)[:KNOWN]
+    base = fitted(record)
+    line = variants(record, base)[0]
+    later = with_channel(replace(base.model, scaling=None), Ramp(float(record.time[A]), 175.0))
+    fold = np.arange(KNOWN) >= A
+    trial = Trial((later, line), record, (fold,), base, 0, SETTINGS, compared="rehearsed")
+    assert run(trial).model == line
+    alone = run(replace(trial, models=(later,)))
+    assert alone.failure == "'ramp 120 to 175' is constant on the training block"

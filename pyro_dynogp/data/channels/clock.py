@@ -85,7 +85,7 @@ class Ramp(Channel):
     end: float
 
     def _names(self) -> tuple[str, ...]:
-        return (f"ramp {self.begin:.6g} to {self.end:.6g}",)
+        return (f"ramp {self.begin:.9g} to {self.end:.9g}",)
 
     def _columns(self, record: Record) -> np.ndarray:
         return np.clip((record.time - self.begin) / (self.end - self.begin), 0.0, 1.0)
@@ -112,7 +112,7 @@ class RampOfGain(Channel):
     end: float
 
     def _names(self) -> tuple[str, ...]:
-        return (f"{self.channel} times ramp {self.begin:.6g} to {self.end:.6g}",)
+        return (f"{self.channel} times ramp {self.begin:.9g} to {self.end:.9g}",)
 
     def _columns(self, record: Record) -> np.ndarray:
         ramp = Ramp(self.begin, self.end).columns(record)[:, 0]
