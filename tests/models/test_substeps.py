@@ -88,7 +88,8 @@ def test_every_verb_is_that_of_the_finer_record(outputs, irregular, hidden):
     drawn, other = (process.components(samples=5, seed=3) for process in (few, many))
     # Times are rounded otherwise, which a loop through a rough function makes larger and larger.
     first = drawn.mean[:, :10], other.mean[:, ::PARTS][:, :10]
-    np.testing.assert_allclose(*first, rtol=1e-7, atol=1e-9)
+    # Outputs have a size of one; how they are rounded differs between processors.
+    np.testing.assert_allclose(*first, rtol=1e-7, atol=1e-7)
 
 
 def test_the_state_after_a_record():
