@@ -212,8 +212,7 @@ def _from_all_starts(
     if learnt is not None:
         starts = [grown(learnt, starts[0]), *starts]
     steps = steps or STEPS[optimizer]
-    optima = maximise(problem.target, records, starts, run, steps=steps, optimizer=optimizer,
-                      learnt=int(learnt is not None))  # fmt: skip
+    optima = maximise(problem.target, records, starts, run, steps=steps, optimizer=optimizer)
     return _with_others_around(problem, optima, run, optimizer, steps) if model.late else optima
 
 
