@@ -208,24 +208,25 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
     def refitted(models: Sequence[Model]) -> list[Fit]:
         return [refit(trial.base, training, model=model, run=trial.run) for model in models]
 
-    def rated(models: Sequence[Model]) -> list[tuple[Fit, np.ndarray, np.ndarray]]:
-        return [(fit, *scored(fit, trial.record, fold, trial.score)) for fit in refitted(models)]
+    def rated(fits: Sequence[Fit]) -> list[tuple[Fit, np.ndarray, np.ndarray]]:
+        return [(fit, *scored(fit, trial.record, fold, trial.score)) for fit in fits]
 
     if trial.compared == "rehearsed":
         fits = _fitted(trial, training)
-        fits = lasting(fits, trial.base, trial.record, fold, trial.run, settings) or fits[-1:]
-        found = [(fit, *scored(fit, trial.record, fold, trial.score)) for fit in fits]
+        found = rated(
+            lasting(fits, trial.base, trial.record, fold, trial.run, settings) or fits[-1:]
+        )
     else:
-        found = rated(trial.models[:2])
+        found = rated(refitted(trial.models[:2]))
         leading, most, errors = max(found, key=lambda one: float(one[1].sum()))
         if trial.models[2:] and not _are_noise(errors, leading):
             least = held_out_density(trial.base, trial.record, fold, trial.score)
             if most.sum() > least.sum():
-                found += rated(trial.models[2:])
+                found += rated(refitted(trial.models[2:]))
+    shape = trial.compared == "held out"
     best, highest, _ = found[0]
     for one, own, _ in found[1:]:
         gain = own - highest
-        shape = trial.compared == "held out"
         if certain(gain, settings) or (shape and _is_more_probable(one, best, gain, settings)):
             best, highest = one, own
     return best

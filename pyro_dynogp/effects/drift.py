@@ -108,7 +108,7 @@ class Drift(Effect):
         if evidence.where["form"] == "additive":
             path = with_process_noise(with_pairs(model, 1))
             return [with_channel(model, Trend(begin, end)), path]
-        drifting = [one for one in model.channels if isinstance(one, (TrendOfGain, RampOfGain))]
+        drifting = [one for one in model.channels if isinstance(one, TrendOfGain)]
         made = {name for one in drifting for name in one.names}
         prepared = model.check(record)[0]
         driving = prepared.input_names[: prepared.n_inputs - model.direct]

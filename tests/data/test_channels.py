@@ -130,6 +130,7 @@ def test_ramps_make_a_path_that_is_held() -> None:
     pairs = list(itertools.pairwise(knots))
     level = np.interp(own.time, knots, levels)
     ramps = np.column_stack([channels.Ramp(*ends).columns(own)[:, 0] for ends in pairs])
+    # Up to rounding.
     np.testing.assert_allclose(ramps @ np.diff(levels), level, atol=1e-12)
     gains = [channels.RampOfGain("load", 0.1, *ends).columns(own)[:, 0] for ends in pairs]
     expected = (own.inputs[:, 1] - 0.1) * level

@@ -60,6 +60,7 @@ class TrendOfGain(Channel):
         begin, end: [time unit].
     """
 
+    course: ClassVar[type[Trend]] = Trend
     channel: str
     centre: float
     begin: float
@@ -69,30 +70,26 @@ class TrendOfGain(Channel):
         return (f"{self.channel} times trend",)
 
     def _columns(self, record: Record) -> np.ndarray:
-        line = (record.time - self.begin) / (self.end - self.begin)
+        line = self.course(self.begin, self.end).columns(record)[:, 0]
         return (signal_of(record, self.channel) - self.centre) * line
 
 
 @dataclass(frozen=True)
-class Ramp(Channel):
+class Ramp(Trend):
     """Zero until `begin`, one from `end` on [time unit], a straight line between them.
 
     Several make a path of the output's level.
     """
 
-    direct: ClassVar[bool] = True
-    begin: float
-    end: float
-
     def _names(self) -> tuple[str, ...]:
         return (f"ramp {self.begin:.9g} to {self.end:.9g}",)
 
     def _columns(self, record: Record) -> np.ndarray:
-        return np.clip((record.time - self.begin) / (self.end - self.begin), 0.0, 1.0)
+        return np.clip(super()._columns(record), 0.0, 1.0)
 
 
 @dataclass(frozen=True)
-class RampOfGain(Channel):
+class RampOfGain(TrendOfGain):
     """An input times a `Ramp`. Several make a path of a gain.
 
     Args:
@@ -106,17 +103,10 @@ class RampOfGain(Channel):
         array([0., 1., 2., 2.])
     """
 
-    channel: str
-    centre: float
-    begin: float
-    end: float
+    course: ClassVar[type[Trend]] = Ramp
 
     def _names(self) -> tuple[str, ...]:
         return (f"{self.channel} times ramp {self.begin:.9g} to {self.end:.9g}",)
-
-    def _columns(self, record: Record) -> np.ndarray:
-        ramp = Ramp(self.begin, self.end).columns(record)[:, 0]
-        return (signal_of(record, self.channel) - self.centre) * ramp
 
 
 @dataclass(frozen=True)

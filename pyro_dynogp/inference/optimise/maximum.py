@@ -262,36 +262,32 @@ def maximise(
         )
         return [optimum for batch in found for optimum in batch]
 
-    def best_first(optima: list[Optimum]) -> list[Optimum]:
-        return [optima[k] for k in _order(optima)]
-
     if len(starts) == 1:
         return climb(starts, steps, "optimum", last=True)
-    behind: list[Optimum] = []
+    behind: list[int] = []
     ranked: Sequence[tuple[int, float]] = ((max(1, steps // 5), effort.kept),)
     if optimizer == "gauss-newton":
         ranked = RANKED_FUNCTIONS if getattr(model, "has_function", False) else RANKED
     (first, _), *further = _stages(ranked, steps, effort.kept)
     found = climb(starts, first, "starts", last=not further)
-    order = _order(found)
+
+    def best_first(places: Sequence[int]) -> list[int]:
+        least = min(found[k].energy for k in places)
+        return sorted(places, key=lambda k: round(found[k].energy - least, TIED))
+
+    order = best_first(range(len(found)))
     for stage, (count, kept) in enumerate(further):
         cut = max(1, math.ceil(kept * len(order) - 0.5))
         leading = [k for place, k in enumerate(order) if place < cut or k < learnt]
-        behind += [found[k] for k in order if k not in leading]
+        behind += [k for k in order if k not in leading]
         label = "optima" if stage == 0 else f"optima-{stage}"
         last = stage == len(further) - 1
         goes_on = climb([found[k].values for k in leading], count, label, last=last)
         for k, after in zip(leading, goes_on, strict=True):
             history = np.concatenate([found[k].history, after.history])
             found[k] = replace(after, history=history)
-        order = [leading[place] for place in _order([found[k] for k in leading])]
-    return best_first([*(found[k] for k in order), *behind])
-
-
-def _order(optima: Sequence[Optimum]) -> list[int]:
-    """Places of optima, those of the best first."""
-    least = min(optimum.energy for optimum in optima)
-    return sorted(range(len(optima)), key=lambda k: round(optima[k].energy - least, TIED))
+        order = best_first(leading)
+    return [found[k] for k in best_first([*order, *behind])]
 
 
 def _stages(
