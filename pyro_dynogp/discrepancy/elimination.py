@@ -13,7 +13,7 @@ from pyro_dynogp.discrepancy.held_out import certain, held_out_density
 from pyro_dynogp.discrepancy.result import Attempt, EffectTest
 from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.fitting import Fit
-from pyro_dynogp.inference.stability import log_bayes_factor
+from pyro_dynogp.inference.schwarz import log_bayes_factor
 from pyro_dynogp.models.variants import Model, without_channels_of
 from pyro_dynogp.statistics.evidence import Residuals
 from pyro_dynogp.statistics.settings import LoopSettings
@@ -54,13 +54,15 @@ def without(added: Sequence[Added], place: int, refit: Refit) -> list[Added] | N
         own = replace(model, scaling=None)
         return without_channels_of(own, gone.model or own, gone.before)
 
-    left, base = list(added[:place]), added[place].base
+    left, base, smaller = list(added[:place]), added[place].base, []
     for one in added[place + 1 :]:
         assert one.confirmed.model is not None
         before, after = reduced(one.confirmed.before), reduced(one.confirmed.model)
         whole = reduced(one.fit.model)
         if before is None or after is None or whole is None:
             return None
+        smaller.append((one, before, after, whole))
+    for one, before, after, whole in smaller:
         fit = refit(base, whole)
         confirmed = replace(one.confirmed, before=before, model=after, fit=None)
         left.append(replace(one, confirmed=confirmed, base=base, fit=fit))

@@ -15,9 +15,9 @@ from pyro_dynogp.discrepancy.held_out import certain, held_out_density, scored, 
 from pyro_dynogp.discrepancy.rehearsal import lasting
 from pyro_dynogp.effects.base import Compared, Score
 from pyro_dynogp.fitting import Fit
-from pyro_dynogp.inference.refit import energy, race, refit
+from pyro_dynogp.inference.refit import race, refit, refits
 from pyro_dynogp.inference.run import Run
-from pyro_dynogp.inference.stability import log_bayes_factor
+from pyro_dynogp.inference.schwarz import energy, log_bayes_factor
 from pyro_dynogp.models.delays import comparable, longest_delay
 from pyro_dynogp.models.variants import Model, with_usual_substeps
 from pyro_dynogp.statistics.settings import LoopSettings
@@ -149,7 +149,7 @@ def _kept(trial: Trial, training: Record) -> Fit:
         same = comparable(training, [*trial.models, *finer], trial.settings.reach)
         found, problems = race(trial.base, trial.models, same, trial.run)
         if not found:
-            raise ValueError(problems[0])
+            raise problems[0]
         start = found[0]
         longest = trial.settings.reach * longest_delay(*trial.models, *finer)
         for times in range(trial.settings.refinements):
@@ -212,7 +212,10 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
         return [(fit, *scored(fit, trial.record, fold, trial.score)) for fit in fits]
 
     if trial.compared == "rehearsed":
-        fits = _fitted(trial, training)
+        # But those that the training data say nothing of, as a later ramp.
+        fits, problems = refits(trial.base, trial.models, training, lambda _: trial.run)
+        if not fits:
+            raise problems[0]
         found = rated(
             lasting(fits, trial.base, trial.record, fold, trial.run, settings) or fits[-1:]
         )
@@ -230,23 +233,6 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
         if certain(gain, settings) or (shape and _is_more_probable(one, best, gain, settings)):
             best, highest = one, own
     return best
-
-
-def _fitted(trial: Trial, training: Record) -> list[Fit]:
-    """Fits of all variants but those that the training data say nothing of, as a later ramp.
-
-    Raises:
-        ValueError: where none can be fitted.
-    """
-    fits, problems = [], []
-    for model in trial.models:
-        try:
-            fits.append(refit(trial.base, training, model=model, run=trial.run))
-        except ValueError as error:
-            problems.append(error)
-    if not fits:
-        raise problems[0]
-    return fits
 
 
 def _are_noise(errors: np.ndarray, fit: Fit) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 from typing import TypeVar
@@ -14,7 +14,7 @@ from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.function_evidence import kernel_sites, kernels_by_evidence
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.importance import with_draws_around
-from pyro_dynogp.inference.methods.mode import at_optimum, climb, louder, most_probable
+from pyro_dynogp.inference.methods.mode import at_optimum, climb
 from pyro_dynogp.inference.methods.nuts import sample_posterior
 from pyro_dynogp.inference.methods.optima import POLISH, Hyperparameters, posterior_of
 from pyro_dynogp.inference.methods.svi import Schedule
@@ -28,9 +28,11 @@ from pyro_dynogp.inference.optimise.maximum import (
 from pyro_dynogp.inference.optimise.optimum import Optimum
 from pyro_dynogp.inference.posteriors import Mixture, Sampled, draws_of_guide
 from pyro_dynogp.inference.run import Run
+from pyro_dynogp.inference.schwarz import energy
 from pyro_dynogp.inference.starts.dynamic import Values
 from pyro_dynogp.inference.starts.extended import extended_starts
 from pyro_dynogp.inference.starts.linear import linear_starts
+from pyro_dynogp.inference.starts.noise import louder, most_probable, with_likely_noise
 from pyro_dynogp.inference.starts.plans import starting_points
 from pyro_dynogp.inference.starts.poles import grown
 from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
@@ -103,7 +105,7 @@ def refit(
 
 def race(
     fit: FittedKind, models: Sequence[Model], record: Record, run: Run
-) -> tuple[list[FittedKind], list[str]]:
+) -> tuple[list[FittedKind], list[ValueError]]:
     """Variants that extend a mode, the most probable first, and why others could not be fitted.
 
     All take a few steps from what the fit has learnt, the leading ones more: a variant that is
@@ -112,8 +114,6 @@ def race(
     Args:
         fit: a mode. models: that extend its model. record: training record. run: its seed counts.
     """
-    found: list[FittedKind] = []
-    problems: list[str] = []
 
     def after(steps: tuple[int, int], optimizer: str) -> Run:
         newton, other = steps
@@ -123,11 +123,7 @@ def race(
         layered = len(model.layers) > len(fit.model.layers)
         return _optimizer_of_layer(model) if layered else optimizer_near(model)
 
-    for model in models:
-        try:
-            found.append(refit(fit, record, model=model, run=after(FIRST_STEPS, first(model))))
-        except ValueError as error:  # for instance a channel that is constant there
-            problems.append(str(error))
+    found, problems = refits(fit, models, record, lambda model: after(FIRST_STEPS, first(model)))
     found.sort(key=energy)
     cut = max(FEWEST, round(LEADING * len(found)))
     further = [
@@ -136,9 +132,18 @@ def race(
     return sorted([*further, *found[cut:]], key=energy), problems
 
 
-def energy(fit: Fitted) -> float:
-    """-log p(y, values) at the mode [nats]."""
-    return float(fit.start_energies[0])
+def refits(
+    fit: FittedKind, models: Sequence[Model], record: Record, run_of: Callable[[Model], Run]
+) -> tuple[list[FittedKind], list[ValueError]]:
+    """Refits of models that can be fitted, and why others cannot: a channel is constant there."""
+    found: list[FittedKind] = []
+    problems: list[ValueError] = []
+    for model in models:
+        try:
+            found.append(refit(fit, record, model=model, run=run_of(model)))
+        except ValueError as error:
+            problems.append(error)
+    return found, problems
 
 
 def optima_of(fit: Fitted) -> list[Values]:
@@ -271,7 +276,7 @@ def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
         return climb(target, records, starts, [], run, optimizer=optimizer, effort=effort,
                      steps=run.steps or ADDED_STEPS[optimizer])  # fmt: skip
     if run.steps:  # a few, to compare variants
-        return climbed(target, [most_probable(problem, starts)], run.steps)
+        return climbed(target, [most_probable(target, records, starts)], run.steps)
     if target.is_linear:
         before, after = (one.dynamic[0][1] for one in (fit.model, target))
         more = after.pairs > before.pairs or after.integrators > before.integrators
@@ -279,8 +284,8 @@ def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
         return climbed(target, [*fresh, *starts], LINEAR_STEPS)
     if have_same_parameters(target, fit.model):  # nothing is new but data, or substeps
         (start, *_) = starts
-        if target.has_feedback:  # free runs may be far off there
-            start = most_probable(problem, [start, louder(start)])
+        if target.has_feedback:
+            start = with_likely_noise(target, records, start)
         return climbed(target, [start], LAYERED_STEPS)
     quiet = without_noise_below_functions(target)
     if quiet != target:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.schwarz import counted
 from pyro_dynogp.statistics.growth import least_stable_pole
 
 # A plant is unstable where a pole multiplies its state by exp(GROWTH) within the record and lies
@@ -42,23 +41,6 @@ def of_numbers(fit: Fitted) -> tuple[str, ...]:
         "are likely to be too narrow, and forecasts to be far off: check(fit) says how forecasts "
         "hold within the record. Take fewer pairs or inducing values, or a longer record.",
     )
-
-
-def counted(fit: Fitted) -> tuple[int, int]:
-    """Free numbers of a fit, and measured outputs that it was fitted to."""
-    numbers = sum(value.numel() for value in fit.mode.values())
-    return numbers, sum(int((~record.missing).sum()) for record in fit.records)
-
-
-def log_bayes_factor(one: Fitted, other: Fitted) -> float:
-    """Of one fit against another of the same data [nats]: how far these speak for it.
-
-    Its further parameters are paid for: Schwarz (Ann. Stat. 6:461, 1978), with posterior modes in
-    place of maximum likelihood.
-    """
-    (numbers, measured), (fewer, _) = counted(one), counted(other)
-    gain = float(other.start_energies[0] - one.start_energies[0])
-    return gain - 0.5 * (numbers - fewer) * math.log(measured)
 
 
 def is_unstable(rate: float, error: float, duration: float) -> bool:

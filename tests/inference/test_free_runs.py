@@ -13,6 +13,7 @@ from pyro_dynogp.inference.free_runs import free_run_error, noise_pays
 from pyro_dynogp.inference.methods import mode
 from pyro_dynogp.inference.optimise.optimum import Optimum
 from pyro_dynogp.inference.run import Run
+from pyro_dynogp.inference.starts.noise import FAINT
 from pyro_dynogp.inference.starts.plans import starting_points
 from pyro_dynogp.models.outputs import output_process
 from tests.models.closed_loops import ClosedLoop, make_record, spring, system_at, values_of
@@ -165,5 +166,5 @@ def test_process_noise_begins_faint_after_climbs_without_any(monkeypatch):
     assert len(quiet) == 2
     scale = "g_noise_gain_local_scale"
     assert torch.equal(learnt[scale], starts[0][scale])  # what is learnt stays
-    assert torch.allclose(noisy[scale], mode.FAINT * starts[0][scale])
+    assert torch.allclose(noisy[scale], FAINT * starts[0][scale])
     assert torch.equal(noisy["f_values"], quiet[0]["f_values"])

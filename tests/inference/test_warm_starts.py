@@ -14,17 +14,18 @@ from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.optimise import maximum
 from pyro_dynogp.inference.optimise.optimum import Optimum
 from pyro_dynogp.inference.run import Run
+from pyro_dynogp.inference.starts import noise
 from pyro_dynogp.inference.starts.plans import starting_points
 from tests.models.closed_loops import make_record
 
 RUN = Run(0, 1, False)
 
 
-def first_point(monkeypatch, model, noise):
+def first_point(monkeypatch, model, sd):
     """The point that a climb from another fit begins at, by the noise which that has learnt."""
     problem = Problem.of(model, make_record(missing=False))
     (usual,) = starting_points(problem.target, problem.records, RUN, count=1, steps=5)
-    learnt = {**usual, "noise_sd": torch.full_like(usual["noise_sd"], noise)}
+    learnt = {**usual, "noise_sd": torch.full_like(usual["noise_sd"], sd)}
     seen = []
 
     def climb(model, records, starts, warm, *_, **__):
@@ -37,10 +38,10 @@ def first_point(monkeypatch, model, noise):
     return float(seen[0]["noise_sd"])
 
 
-@pytest.mark.parametrize(("noise", "begins"), [(1e-3, mode.UNEXPLAINED), (0.6, 0.6)])
-def test_in_feedback_with_more_noise_where_that_is_more_probable(monkeypatch, noise, begins):
+@pytest.mark.parametrize(("sd", "begins"), [(1e-3, noise.UNEXPLAINED), (0.6, 0.6)])
+def test_in_feedback_with_more_noise_where_that_is_more_probable(monkeypatch, sd, begins):
     model = dgp.NonlinearFeedback(1, pairs=2, process_noise=False)
-    assert first_point(monkeypatch, model, noise) == pytest.approx(begins)
+    assert first_point(monkeypatch, model, sd) == pytest.approx(begins)
 
 
 def test_elsewhere_with_the_noise_that_is_learnt(monkeypatch):
@@ -58,7 +59,7 @@ def test_the_most_probable_of_several_starts():
         float(potential.values_and_gradients(potential.pack(p).numpy()[None])[0][0]) for p in points
     ]
     assert min(energies) == energies[1]
-    assert mode.most_probable(problem, points) is points[1]
+    assert noise.most_probable(problem.target, problem.records, points) is points[1]
 
 
 @pytest.mark.parametrize(("optimizer", "lasts"), [("gauss-newton", 2), ("lbfgs", 1)])
@@ -112,7 +113,7 @@ def test_a_fit_with_other_substeps_begins_with_more_noise_where_that_is_more_pro
     quiet = fit.mode["noise_sd"]
     seen = []
 
-    def compared(problem, points):
+    def compared(model, records, points):
         seen.append([float(point["noise_sd"]) for point in points])
         return points[1]
 
@@ -120,10 +121,10 @@ def test_a_fit_with_other_substeps_begins_with_more_noise_where_that_is_more_pro
         seen.append([float(point["noise_sd"]) for point in points])
         return [Optimum(0.0, points[0], np.zeros(1), "")]
 
-    monkeypatch.setattr(again, "most_probable", compared)
+    monkeypatch.setattr(noise, "most_probable", compared)
     monkeypatch.setattr(again, "maximise", climbed)
     monkeypatch.setattr(again, "kernels_by_evidence", lambda model, records, optima, run: optima)
     finer = dgp.NonlinearFeedback(1, pairs=1, process_noise=False, substeps=3)
     again.refit(fit, record, model=finer, run=RUN)
-    louder = max(mode.UNEXPLAINED, float(quiet))
+    louder = max(noise.UNEXPLAINED, float(quiet))
     assert seen == [[pytest.approx(float(quiet)), louder], [louder]]

@@ -10,7 +10,7 @@ from typing import get_args
 
 import numpy as np
 
-from pyro_dynogp.inference.density import WALL, Potential
+from pyro_dynogp.inference.density import WALL
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.free_runs import free_run_error, noise_pays, silenced
 from pyro_dynogp.inference.function_evidence import kernels_by_evidence
@@ -28,9 +28,9 @@ from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.delays import moved
 from pyro_dynogp.inference.starts.linear import RANDOM, linear_starts, linear_twins
+from pyro_dynogp.inference.starts.noise import faint, louder, with_likely_noise
 from pyro_dynogp.inference.starts.plans import Plan, Values, starting_point, starts_of
 from pyro_dynogp.inference.starts.poles import grown
-from pyro_dynogp.layers.noise import TYPICAL
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import Records, as_measured
 from pyro_dynogp.models.variants import without_noise_below_functions
@@ -48,9 +48,6 @@ FUNCTION_STEPS: Mapping[str, int] = MappingProxyType(
 )
 # Optima along an excerpt of a long record from which climbs go on along the whole.
 CARRIED = 3
-# Process noise at which climbs from optima without any begin, as a share of that of a linear fit,
-# which has it explain what the functions should.
-FAINT = 0.03
 # Restarts of models with functions, and of those with feedback of measured signals alone. Hidden
 # ones have more poor optima (tanks that overflow: errors of 22.7 and 2.1 times the noise with four
 # restarts, and of 4.6 and 1.1 times with eight, for a fifth more time).
@@ -64,35 +61,6 @@ NO_BETTER = (
 )
 # Half of the starts of models with functions climb to the end.
 HALF = Effort(kept=0.5)
-# Measurement noise, in sds of the outputs, from which starts without process noise climb at least.
-UNEXPLAINED = 0.5
-
-
-def louder(values: Values) -> Values:
-    """A start whose measurement noise can stand for what dynamics and functions lack as yet.
-
-    Linear fits leave that to process noise. Without any, noise of their size makes the density so
-    steep that the climb ends on its slopes.
-    """
-    least = {"noise_sd": UNEXPLAINED, "log_noise_constant": math.log(UNEXPLAINED / TYPICAL)}
-    return {
-        name: value.clamp_min(least[name]) if name in least else value
-        for name, value in values.items()
-    }
-
-
-def most_probable(problem: Problem, points: Sequence[Values]) -> Values:
-    """The most probable of several starts."""
-    potential = Potential(problem.target, (problem.records,), points[0])
-    return points[int(potential.energies_at(points).argmin())]
-
-
-def _faint(values: Values) -> Values:
-    """A start whose process noise is `FAINT`."""
-    scales = ("_noise_gain_local_scale", "_integrator_noise")
-    return {
-        name: FAINT * value if name.endswith(scales) else value for name, value in values.items()
-    }
 
 
 @dataclass(frozen=True)
@@ -247,8 +215,8 @@ def cascade_optima(problem: Problem, run: Run, optimizer: Optimizer, steps: int)
         least = min([least, *(free_run_error(one, at[0], own) for one, own, at in lines)])
         starts = starts_of(model, records, twins, run.restarts or usual, again.seed)
         warm = [] if learnt is None else [grown(learnt, starts[0])]
-        if model.has_feedback:  # on other data its free runs may be far off
-            warm = [most_probable(problem, [one, louder(one)]) for one in warm]
+        if model.has_feedback:
+            warm = [with_likely_noise(model, records, one) for one in warm]
         optima += climb(
             model, records, starts, warm, again, steps=steps, optimizer=optimizer,
             prefix=f"again-{attempt}-" if attempt else "", line=least,
@@ -318,7 +286,7 @@ def climb(
         key = f"{prefix}without-process-noise"
         found = optima_of(quiet, [louder(start) for start in starts], key)
         better = found[: (len(starts) + 1) // 2]
-        starts = [grown(one.values, _faint(starts[0])) for one in better]
+        starts = [grown(one.values, faint(starts[0])) for one in better]
     elif model.has_feedback:
         starts = [louder(start) for start in starts]
     optima = optima_of(model, [*learnt, *starts], f"{prefix}cascade", len(learnt))

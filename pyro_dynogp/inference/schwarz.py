@@ -1,0 +1,28 @@
+"""Evidence of posterior modes by Schwarz's criterion."""
+
+from __future__ import annotations
+
+import math
+
+from pyro_dynogp.inference.fitted import Fitted
+
+
+def energy(fit: Fitted) -> float:
+    """-log p(y, values) at the mode [nats]."""
+    return float(fit.start_energies[0])
+
+
+def counted(fit: Fitted) -> tuple[int, int]:
+    """Free numbers of a fit, and measured outputs that it was fitted to."""
+    numbers = sum(value.numel() for value in fit.mode.values())
+    return numbers, sum(int((~record.missing).sum()) for record in fit.records)
+
+
+def log_bayes_factor(one: Fitted, other: Fitted) -> float:
+    """Of one fit against another of the same data [nats]: how far these speak for it.
+
+    Its further parameters are paid for: Schwarz (Ann. Stat. 6:461, 1978), with posterior modes in
+    place of maximum likelihood.
+    """
+    (numbers, measured), (fewer, _) = counted(one), counted(other)
+    return energy(other) - energy(one) - 0.5 * (numbers - fewer) * math.log(measured)
