@@ -67,6 +67,7 @@ if TYPE_CHECKING:  # the same names, for editors and type checkers; a test compa
     from pyro_dynogp.models.model import Model as Model
     from pyro_dynogp.models.nonlinear_feedback import NonlinearFeedback as NonlinearFeedback
     from pyro_dynogp.models.priors import sample_modes as sample_modes
+    from pyro_dynogp.models.product import Product as Product
     from pyro_dynogp.models.step import Step as Step
     from pyro_dynogp.prediction.prediction import Prediction as Prediction
     from pyro_dynogp.prediction.scores import scores as scores
@@ -103,6 +104,7 @@ HOMES = {
     "Dynamic": "models.layer",
     "Known": "models.layer",
     "Static": "models.layer",
+    "Product": "models.product",
     "Step": "models.step",
     "Gaussian": "layers.noise",
     "StudentT": "layers.noise",

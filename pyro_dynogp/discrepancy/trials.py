@@ -199,9 +199,10 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
 
     Where they differ in how they extrapolate what is right in one stretch may be luck: of those
     that are rehearsed only those count whose forecasts are no worse than those of the base held at
-    its last level, or else the last one, which leaves most open. Of others the third and later ones
-    join what the first two are, and take most of the time: where neither of these forecasts better
-    than the base, or one leaves nothing but noise, they are not fitted.
+    its last level, or else the last one, which leaves most open. Of others the first two are
+    fitted, and later ones while none leaves nothing but noise; those that join what earlier ones
+    have, which take most of the time, only where one of these forecasts best, and better than the
+    base.
     """
     fold, settings = trial.folds[0], trial.settings
 
@@ -221,11 +222,15 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
         )
     else:
         found = rated(refitted(trial.models[:2]))
-        leading, most, errors = max(found, key=lambda one: float(one[1].sum()))
-        if trial.models[2:] and not _are_noise(errors, leading):
-            least = held_out_density(trial.base, trial.record, fold, trial.score)
-            if most.sum() > least.sum():
-                found += rated(refitted(trial.models[2:]))
+        for place, model in enumerate(trial.models[2:], 2):
+            leading, most, errors = max(found, key=lambda one: float(one[1].sum()))
+            if _are_noise(errors, leading):
+                break
+            if _joins(model, trial.models[:place]):
+                least = held_out_density(trial.base, trial.record, fold, trial.score)
+                if most.sum() <= least.sum() or not _joins(model, [_unscaled(leading)]):
+                    continue
+            found += rated(refitted([model]))
     shape = trial.compared == "held out"
     best, highest, _ = found[0]
     for one, own, _ in found[1:]:
@@ -233,6 +238,14 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
         if certain(gain, settings) or (shape and _is_more_probable(one, best, gain, settings)):
             best, highest = one, own
     return best
+
+
+def _joins(model: Model, earlier: Sequence[Model]) -> bool:
+    """Whether a variant has what another one sends back, and more."""
+    own, *others = (
+        {name for _, layer in one.dynamic for name in layer.feedback} for one in (model, *earlier)
+    )
+    return any(other < own for other in others)
 
 
 def _are_noise(errors: np.ndarray, fit: Fit) -> bool:

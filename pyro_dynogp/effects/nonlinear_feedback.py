@@ -1,4 +1,4 @@
-"""A function of the output that acts back on the dynamics: a spring, a friction, an outflow."""
+"""What acts back on the dynamics: a spring, a friction, an outflow, a flow that carries heat."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ import torch
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.signals import hermite, hinges
 from pyro_dynogp.effects.base import Effect, Parameters
+from pyro_dynogp.effects.bilinear import dominant_rates, products
 from pyro_dynogp.lti.views import steady_state_gain
+from pyro_dynogp.models.product import is_product
 from pyro_dynogp.models.system import DynamicSystem
-from pyro_dynogp.models.variants import Model, with_feedback
+from pyro_dynogp.models.variants import Model, with_feedback, with_products
 from pyro_dynogp.models.wiring import HIDDEN
 from pyro_dynogp.statistics.bootstrap import Scan
 from pyro_dynogp.statistics.detecting import lasting
@@ -36,6 +38,8 @@ NAMES = ("low end", "middle", "high end")
 LAGS = 7
 # Standard errors by which two of their slopes must differ to be said to.
 CERTAIN = 2.0
+# Share of what the best column gains from which on products are tried beside functions.
+ALIKE = 0.5
 
 
 def nonlinear_feedback(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> Evidence:
@@ -46,15 +50,18 @@ def nonlinear_feedback(residuals: Residuals, settings: LoopSettings, *, seed: in
     columns are h(mean) through each pole (`filtered`), with shapes h as in the test for a function
     of the output: Hermite polynomials of the second and third degree, apart and together, and
     piecewise linear functions with one knot; then the same of the mean's rate of change, which is
-    what friction acts on where a position is measured. What the mean itself does through the poles
-    is nuisance. A sensor that is not linear sets this test off as well: refits tell the two apart.
-    `where`: ``output``, its name.
+    what friction acts on where a position is measured; and h = u y, products of each input with the
+    mean. What the mean itself does through the poles is nuisance. A sensor that is not linear sets
+    this test off as well: refits tell the two apart.
+    `where`: ``output``, its name; ``products``, what the best product gains of what the best column
+    does, zero to one.
 
     Where what is missing is large the simulated mean is far from the output, and says little of h;
     a controller can hide it there altogether. One step ahead h is known from what was measured: the
-    second test is of the innovations of a linear model, which functions of past outputs do not
-    foretell where nothing is missing. The smaller of the two p-values counts, twice. (Functions
-    that a model has err beyond their data, and look like others there: no second test then.)
+    second test is of the innovations of a linear model, which functions of past outputs, and their
+    products with inputs, do not foretell where nothing is missing. The smaller of the two p-values
+    counts, twice. (Functions that a model has err beyond their data, and look like others there: no
+    second test then.)
 
     Source: first-order Volterra response of a feedback loop (Schetzen, The Volterra and Wiener
     Theories of Nonlinear Systems, 1980, chapter 8); shapes after Ramsey's RESET, J. R. Stat. Soc. B
@@ -62,6 +69,7 @@ def nonlinear_feedback(residuals: Residuals, settings: LoopSettings, *, seed: in
     """
     r = residuals
     shapes = [*_shapes(r.mean), *_shapes(np.gradient(r.mean, r.time))]
+    shapes += products(r.inputs, r.mean)
     variants = [_driven(r, shape) for shape in shapes]
     nuisance = _driven(r, r.mean[:, None])
     scan = lasting(r, variants, nuisance, settings, seed)
@@ -70,11 +78,14 @@ def nonlinear_feedback(residuals: Residuals, settings: LoopSettings, *, seed: in
         ahead = _one_step_ahead(r, settings, seed)
         best = min(scan, ahead, key=lambda one: one.p_value)
         best = replace(best, p_value=min(1.0, 2.0 * best.p_value))
+    share = 0.0
+    if r.inputs.shape[1]:
+        share = float(np.clip(best.gains[-r.inputs.shape[1] :].max() / best.gain, 0.0, 1.0))
     label = labelled(f"simulated {r.output_name}", r.output_unit)
     return evidence(
         "nonlinear feedback",
         best,
-        {"output": r.output_name},
+        {"output": r.output_name, "products": share},
         f"A nonlinear function of '{r.output_name}' acts back on its dynamics, "
         f"{about(r, scan.size)}.",
         against(r, r.mean, label, nuisance, scan.fitted),
@@ -97,6 +108,7 @@ def _one_step_ahead(r: Residuals, settings: LoopSettings, seed: int) -> Scan:
     )
     last = _earlier(y, 1)
     shapes = [*_shapes(last), *_shapes(last - _earlier(y, 2))]
+    shapes += products(_earlier(r.inputs, 1), last)
     variants = [with_past(shape) for shape in shapes]
     lags = [_earlier(y, k + 1) for k in range(LAGS)]
     lags += [_earlier(r.inputs, k) for k in range(LAGS)]
@@ -124,10 +136,11 @@ def _driven(r: Residuals, signals: np.ndarray) -> np.ndarray:
 
 
 class NonlinearFeedbackOfOutput(Effect):
-    """A function that acts back on the dynamics: spring, friction, outflow.
+    """What acts back on the dynamics: spring, friction, outflow, a flow that carries heat.
 
-    Of the output, of a signal of the same states that nothing measures (a velocity, the level of
-    another tank), or one of each; a later one of them only where it is certainly better.
+    A function of the output, of a signal of the same states that nothing measures (a velocity, the
+    level of another tank), or one of each; products of the inputs with the output, or with such a
+    signal. A later one of them only where it is certainly better.
     """
 
     name = "nonlinear feedback"
@@ -144,27 +157,47 @@ class NonlinearFeedbackOfOutput(Effect):
     test = staticmethod(nonlinear_feedback)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
-        """Static layers that see the last dynamic layer and act back on it."""
-        kinds = ((True, False), (False, True), (True, True))
-        extended = [with_feedback(model, output=output, hidden=hidden) for output, hidden in kinds]
+        """Static layers that see the last dynamic layer and act back on it.
+
+        Products come first where the test has one as its best column, and are left out where none
+        gains nearly as much: refits take as long as those of functions.
+        """
+        share = float(evidence.where["products"])
+        functions = [with_feedback(model), with_feedback(model, output=False, hidden=True)]
+        products = [with_products(model), with_products(model, hidden=True)]
+        leading = [*functions, *products] if share >= ALIKE else functions
+        if share == 1.0:
+            leading = [*products, *functions]
+        extended = [*leading, with_feedback(model, hidden=True)]
         return list({repr(variant): variant for variant in extended if variant}.values())
 
     def sentence(self, evidence: Evidence, model: Model) -> str:
         """Of which signals it is a function."""
-        sources = {wire.name: wire.sources for wire in model.wires}
-        back = [name for wire in model.wires for name in wire.feedback]
-        signals = {signal for name in back for signal in sources[name]}
-        hidden = {name for name in signals if name.endswith(HIDDEN)}
-        if not hidden:
-            return evidence.sentence
+        wires = {wire.name: wire for wire in model.wires}
+        back = [wires[name] for wire in model.wires for name in wire.feedback]
+        functions = {s for one in back if not is_product(one.layer) for s in one.sources}
+        factors = {one.sources[-1] for one in back if is_product(one.layer)}
         y = evidence.where["output"]
         unseen = f"a signal of the dynamics of '{y}' that is not measured"
-        if hidden == signals:
-            return f"A nonlinear function of {unseen} acts back on them."
-        return f"Nonlinear functions of '{y}', and of {unseen}, act back on them."
+        hidden = {name for name in functions if name.endswith(HIDDEN)}
+        said = []
+        if hidden and hidden == functions:
+            said.append(f"A nonlinear function of {unseen} acts back on them.")
+        elif hidden:
+            said.append(f"Nonlinear functions of '{y}', and of {unseen}, act back on them.")
+        elif functions or not factors:
+            said.append(evidence.sentence)
+        for factor in sorted(factors):
+            other = unseen if factor.endswith(HIDDEN) else f"'{y}'"
+            said.append(f"Inputs times {other} act back on its dynamics.")
+        return " ".join(said)
 
     def parameters(self, fit: Fit, evidence: Evidence, record: Record) -> Parameters:
-        """Inverse steady-state gain at the low end, in the middle and at the high end.
+        """What it does to the dynamics, in numbers.
+
+        Of products, the decay rate of the dominant mode where an input is low and where it is high.
+        Of a function, the inverse steady-state gain at the low end, in the middle and at the high
+        end.
 
         The input that holds the output at y is u(y) = (y - G_f f(y)) / G_u, with steady-state gains
         G_u from the input and G_f from what comes back. Posterior mean and standard deviation of
@@ -177,6 +210,8 @@ class NonlinearFeedbackOfOutput(Effect):
         fed = [wire for wire in model.wires if wire.feedback]
         if model.outputs > 1 or len(fed) != 1 or len(fed[0].feedback) != 1 or not fed[0].last:
             return {}
+        if any(is_product(w.layer) for w in model.wires if w.name in fed[0].feedback):
+            return dominant_rates(fit, fed[0], record)
         if len(fed[0].signals) > 1:  # what it sees is hidden
             return {}
         system, (name,) = fit.system_at(fit.draws), fed[0].feedback

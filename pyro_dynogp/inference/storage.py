@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -22,11 +22,11 @@ from pyro_dynogp.inference.density import Site
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.posterior_draws import PosteriorDraws
 from pyro_dynogp.inference.posteriors import Mixture, Posterior, Sampled
+from pyro_dynogp.inference.stored_layers import layer_of, plain_layer
 from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.layers.sites import Values
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.step import Step, is_step
-from pyro_dynogp.models.wiring import Dynamic, Known, Layer, Static
+from pyro_dynogp.models.wiring import Dynamic, Known, Static
 from pyro_dynogp.support.checkpoints import DIGEST, read_tensors, write_tensors
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
@@ -39,7 +39,6 @@ VERSION, OLDEST, UNMARKED = 7, 4, 5
 MODELS = ("Model", "Cascade", "LinearDynamicGP")
 # Arrays of draws with densities, where there are such.
 SOURCE = ("log_p", "log_q", "ancestor")
-LAYERS: dict[str, Callable[..., Layer]] = {"Dynamic": Dynamic, "Static": Static, "Step": Step}
 
 
 def save(fit: Fitted, path: str | Path) -> None:
@@ -174,7 +173,7 @@ def _options(model: Model) -> dict[str, Any]:
     options = {f.name: getattr(model, f.name) for f in fields(model) if f.name != "scaling"}
     options["channels"] = [to_plain(channel) for channel in model.channels]
     for wire in model.wires:
-        if isinstance(wire.layer, Known) and not is_step(wire.layer):
+        if isinstance(wire.layer, Known) and plain_layer(wire.layer) is None:
             raise invalid(
                 "save",
                 expected="layers that are numbers alone",
@@ -189,16 +188,9 @@ def _options(model: Model) -> dict[str, Any]:
                 advice="A file holds numbers alone, no kernel of gpytorch: keep fit.draws and "
                 "the code that makes the model.",
             )
-    options["layers"] = [_plain(layer) for layer in model.layers]
+    options["layers"] = [plain_layer(layer) for layer in model.layers]
     options["likelihood"] = asdict(model.likelihood)
     return options
-
-
-def _plain(layer: Layer) -> dict[str, Any]:
-    """A layer as JSON has it."""
-    kind = "Step" if is_step(layer) else type(layer).__name__
-    names = ("skip", "sees", "name") if is_step(layer) else [f.name for f in fields(layer)]
-    return {"kind": kind, **{name: getattr(layer, name) for name in names}}
 
 
 def _model(name: str, options: Mapping[str, Any], scaling: Scaling) -> Model:
@@ -210,20 +202,11 @@ def _model(name: str, options: Mapping[str, Any], scaling: Scaling) -> Model:
         given["layers"] = (Dynamic(**{option: given.pop(option) for option in own}),)
         given["integrate"] = "all"
     else:
-        given["layers"] = tuple(_layer(layer) for layer in given["layers"])
+        given["layers"] = tuple(layer_of(layer) for layer in given["layers"])
         given["likelihood"] = Likelihood(**given["likelihood"])
         if name == "Cascade" and given["initial_state"] == "site":  # what version 4 called "auto"
             given["initial_state"] = "auto"
     return Model(**given, scaling=scaling)
-
-
-def _layer(options: Mapping[str, Any]) -> Layer:
-    given = dict(options)
-    kind = given.pop("kind")
-    if kind not in LAYERS:
-        raise ValueError(f"load: unknown layer {kind!r}; known are {sorted(LAYERS)}.")
-    given |= {name: tuple(v) for name, v in given.items() if isinstance(v, list)}
-    return LAYERS[kind](**given)
 
 
 def _restore(header: dict[str, Any], tensors: dict[str, Any]) -> Fitted:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.stability import warnings_of
-from pyro_dynogp.models.step import is_step
+from pyro_dynogp.models.description import kind_of
 from pyro_dynogp.models.wiring import Dynamic, Known, Layer
 
 
@@ -42,5 +42,5 @@ def _describe(layer: Layer) -> str:
         integrates = ", an integrator" if layer.integrators else ""
         return f"dynamic, {layer.pairs} pairs{integrates}{width}"
     if isinstance(layer, Known):
-        return f"{'step' if is_step(layer) else 'known function'}{width}"
+        return f"{kind_of(layer)}{width}"
     return f"static, {layer.inducing} inducing values{width}"

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 from pyro_dynogp.data.channels import Channel
 from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.product import is_product
 from pyro_dynogp.models.step import is_step
 from pyro_dynogp.models.wiring import Dynamic, Known, Layer
 
@@ -51,6 +52,11 @@ def describe(model: Model) -> tuple[Part, ...]:
     return (inputs, *driving, *layers, *direct, _noise(model.likelihood))
 
 
+def kind_of(layer: Known) -> str:
+    """What a function that is known is called."""
+    return "step" if is_step(layer) else "product" if is_product(layer) else "known function"
+
+
 def _layer(layer: Layer, *, fed_back: bool) -> Part:
     if isinstance(layer, Dynamic):
         noise = "process noise" if layer.process_noise else "no process noise"
@@ -58,7 +64,7 @@ def _layer(layer: Layer, *, fed_back: bool) -> Part:
         integrates = ", an integrator" if layer.integrators else ""
         return Part("dynamics", "linear dynamics", f"{pairs}{integrates}, {noise}")
     if isinstance(layer, Known):
-        kind = "step" if is_step(layer) else "known function"
+        kind = kind_of(layer)
         heading = f"{kind} in feedback" if fed_back else kind
         return Part("function", heading, ", ".join(layer.parameters))
     limits = [f"{at:.4g}" for at in layer.limits or () if at is not None]

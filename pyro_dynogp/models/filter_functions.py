@@ -13,7 +13,8 @@ from torch import Tensor
 
 from pyro_dynogp.layers.functions import StaticFunction, even_grid
 from pyro_dynogp.models.known import KnownFunction
-from pyro_dynogp.moments.functions import KERNELS, TABLE
+from pyro_dynogp.models.product import Products
+from pyro_dynogp.moments.functions import KERNELS, PRODUCT, TABLE
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.tensors import broadcast
 
@@ -113,6 +114,9 @@ def _function(block: Block, M: int, widest: int) -> tuple[int, dict[str, Tensor]
     if function is None:
         values["slope"] = torch.eye(d, widest, dtype=torch.float64)
         return KERNELS["rbf"], values
+    if isinstance(function, KnownFunction) and isinstance(function.function, Products):
+        _check_known_first(block, function.name, function.function.first)
+        return PRODUCT + function.function.first, values | _shifted(function, widest)
     if isinstance(function, KnownFunction):
         if d > 1:
             raise invalid(
@@ -161,6 +165,34 @@ def _function(block: Block, M: int, widest: int) -> tuple[int, dict[str, Tensor]
     if function.slope is not None:
         values["slope"] = pad(function.slope[..., order], (0, widest - d))
     return KERNELS[name], values
+
+
+def _check_known_first(block: Block, name: str, first: int) -> None:
+    """Refuse products of two signals that are random: moments of these are not exact."""
+    if bool((block.rows[..., :first, :] != 0.0).any()):
+        raise invalid(
+            f"layer {name!r}",
+            expected=f"inputs, or functions of inputs alone, as its first {first} signals",
+            got="signals of dynamics",
+            advice="A function of two signals of dynamics is a Static layer.",
+        )
+
+
+def _shifted(function: KnownFunction, widest: int) -> dict[str, Tensor]:
+    """What products of signals have beside those of the channels: (s + z)(t + w) = s t + ... ."""
+    assert isinstance(function.function, Products)
+    first = function.function.first
+    shift = function.shift
+    s, t = shift[..., :first], shift[..., first:]
+    others = t.shape[-1]
+    eye = torch.eye(function.channels, widest, dtype=torch.float64)
+    slope = [
+        t[..., j, None] * eye[i] + s[..., i, None] * eye[first + j]
+        for i in range(first)
+        for j in range(others)
+    ]
+    constant = (s.unsqueeze(-1) * t.unsqueeze(-2)).flatten(-2)
+    return {"constant": constant, "slope": torch.stack(slope, -2)}
 
 
 def inducing_range(function: StaticFunction) -> tuple[Tensor, Tensor]:

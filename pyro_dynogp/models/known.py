@@ -21,6 +21,7 @@ from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.layers.functions import even_grid
 from pyro_dynogp.layers.sites import Site, Values
 from pyro_dynogp.models.layer import in_double
+from pyro_dynogp.models.product import is_product
 from pyro_dynogp.models.structure import Structure
 from pyro_dynogp.models.wiring import HIDDEN, INPUTS, Known, Wire
 from pyro_dynogp.moments.functions import gauss_hermite
@@ -156,7 +157,7 @@ def known_function(
     zero = torch.zeros(layer.outputs, dtype=torch.float64)
     name = f"layer {place.name!r}"
     f = KnownFunction(layer.function, parameters, shift, scale_, ends, zero, zero + 1.0, name)
-    if place.last and layer.scaled:
+    if (place.last and layer.scaled) or is_product(layer):
         return f
     if place.last:
         level, size = as_tensor(scaling.output_offset), as_tensor(scaling.output_scale)

@@ -20,6 +20,7 @@ from pyro_dynogp.models.wiring import (
     Dynamic,
     Known,
     Layer,
+    Static,
     StaticLayer,
     Wire,
     substeps_of,
@@ -188,6 +189,11 @@ class Structure:
     def has_function(self) -> bool:
         """Whether there is a static layer."""
         return any(isinstance(layer, StaticLayer) for layer in self.layers)
+
+    @property
+    def learns_function(self) -> bool:
+        """Whether there is a static layer whose function is a Gaussian process."""
+        return any(isinstance(layer, Static) for layer in self.layers)
 
     @property
     def dynamic(self) -> tuple[tuple[Wire, Dynamic], ...]:

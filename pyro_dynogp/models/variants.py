@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from pyro_dynogp.data.channels import Channel, count_direct
 from pyro_dynogp.layers.kernels import SMOOTH
 from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.product import Product, is_product
 from pyro_dynogp.models.step import Step, is_step, usual_substeps
 from pyro_dynogp.models.wiring import (
     HIDDEN,
@@ -25,8 +26,9 @@ from pyro_dynogp.models.wiring import (
 # Inducing values of a function that is added.
 INDUCING = 32
 # Names of functions that act back: of a layer's output, and of a signal of it that is hidden, and
-# of a step of the latter.
+# of a step of the latter, and products of inputs with the output or with the hidden signal.
 FEEDBACK, HIDDEN_FEEDBACK, STEP = "feedback", "hidden_feedback", "feedback_step"
+PRODUCT, HIDDEN_PRODUCT = "feedback_product", "hidden_product"
 
 
 def with_channel(model: Model, channel: Channel) -> Model:
@@ -185,18 +187,53 @@ def with_feedback(model: Model, *, output: bool = True, hidden: bool = False) ->
         hidden: whether one sees a further signal of the same states, which nothing measures, and a
             step of it comes back as well.
     """
-    noise = model.likelihood
-    if not model.dynamic or noise.follows_output or not noise.gaussian:
+    if not model.dynamic:
         return None
     seen, layer = model.dynamic[-1]
-    sources = {wire.name: wire.sources for wire in model.wires}
-    before = {sources[name] for name in layer.feedback}
     own, unseen = (seen.name,), (seen.name + HIDDEN,)
     back: list[Static | Known] = []
-    if output and own not in before:
+    if output:
         back.append(_smooth(FEEDBACK, own, layer.outputs))
-    if hidden and unseen not in before:
+    if hidden:
         back += [_smooth(HIDDEN_FEEDBACK, unseen, 1), Step(sees=unseen, name=STEP)]
+    return _fed_back(model, back, hidden=hidden)
+
+
+def with_products(model: Model, *, hidden: bool = False) -> Model | None:
+    """The model with products of inputs and its last dynamic layer's output that act back on it.
+
+    None without inputs, and where `with_feedback` is None.
+
+    Args:
+        model: to extend. hidden: whether inputs multiply a further signal of the same states, which
+            nothing measures, in place of the output.
+    """
+    driving = model.inputs - model.direct
+    if not model.dynamic or not driving:
+        return None
+    seen, layer = model.dynamic[-1]
+    other, count = seen.name, layer.outputs
+    if hidden:
+        other, count = seen.name + HIDDEN, max(layer.hidden, 1)
+    name = HIDDEN_PRODUCT if hidden else PRODUCT
+    extended = _fed_back(
+        model, [Product(driving, count, sees=(INPUTS, other), name=name)], hidden=hidden
+    )
+    return None if extended is None else with_usual_substeps(extended)
+
+
+def _fed_back(model: Model, given: Sequence[Static | Known], *, hidden: bool) -> Model | None:
+    """The model with functions that act back on its last dynamic layer, but those that do.
+
+    Args:
+        hidden: whether one sees a signal that nothing measures.
+    """
+    noise, (seen, layer) = model.likelihood, model.dynamic[-1]
+    if noise.follows_output or not noise.gaussian:
+        return None
+    sources = {wire.name: wire.sources for wire in model.wires}
+    before = {sources[name] for name in layer.feedback}
+    back = [one for one in given if one.sees not in before]
     if not back or (model.has_feedback and not layer.feedback):
         return None
     names = (*layer.feedback, *(str(one.name) for one in back))
@@ -221,7 +258,10 @@ def with_usual_substeps(model: Model, base: Model | None = None) -> Model:
         return model
 
     def finer(_: Wire, layer: Dynamic) -> Dynamic:
-        steps = any(w.name in layer.feedback and is_step(w.layer) for w in model.wires)
+        steps = any(
+            w.name in layer.feedback and (is_step(w.layer) or is_product(w.layer))
+            for w in model.wires
+        )
         parts = usual_substeps(steps=steps, late=bool(model.late))
         return replace(layer, substeps=max(layer.substeps, parts))
 

@@ -15,6 +15,7 @@ from pyro_dynogp.models.layer import Limits as Limits
 from pyro_dynogp.models.layer import Static as Static
 from pyro_dynogp.models.layer import StaticLayer as StaticLayer
 from pyro_dynogp.models.layer import in_double
+from pyro_dynogp.models.product import factors
 from pyro_dynogp.support.errors import COUNT, RULES, instance, invalid, whole
 
 INPUTS = "inputs"
@@ -112,6 +113,7 @@ def wire(inputs: int, layers: Sequence[Layer], output: str | None = None) -> tup
             raise invalid(
                 f"layer {name!r}", expected="inputs for a static layer", got="no channels"
             )
+        _check_product(name, layer, channels)
         if isinstance(layer, Static):
             looped = name in back and channels > 1
             linear = place == 0 or looped or layer.limits is not None
@@ -280,6 +282,17 @@ def _check_known(name: str, layer: Known) -> None:
     if not (numbers and len(ends) == 2 and ends[0] < ends[1]):
         raise invalid(
             f"range of layer {name!r}", expected="(low, high) with low < high", got=repr(ends)
+        )
+
+
+def _check_product(name: str, layer: Layer, channels: int) -> None:
+    """Refuse a product of another number of signals than it sees."""
+    first = factors(layer)
+    if first and channels != first + layer.outputs // first:
+        raise invalid(
+            f"layer {name!r}",
+            expected=f"{first} signals that come first and {layer.outputs // first} others",
+            got=f"{channels} signals",
         )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from pyro_dynogp.lti.lanes import WIDTH, below, choose, exponential, gather, get, put, root, splat
+from pyro_dynogp.moments.functions import PRODUCT
 from pyro_dynogp.support.compiled import BORROWING, WITHIN
 
 # Number of each point.
@@ -67,8 +68,18 @@ def radial(form, square):
 
 
 @njit(**BORROWING)
+def add_products(leading, d, first, z, f):
+    """Add to f, from `first` on, the products of the leading channels of z (d) with the others."""
+    others = d - leading
+    for i in range(leading):
+        for j in range(others):
+            at = first + i * others + j
+            put(f, at, get(f, at) + get(z, i) * get(z, leading + j))
+
+
+@njit(**BORROWING)
 def expand(form, i, d, e, f0, first, values, z, f):
-    """Write the outputs of the radial expansion of static layer i at z (d) to f, from `first` on.
+    """Write the outputs of the expansion of static layer i at z (d) to f, from `first` on.
 
     d, e: its channels and outputs. f0: its first output among all. values: in lanes.
     """
@@ -78,6 +89,9 @@ def expand(form, i, d, e, f0, first, values, z, f):
         for c in range(d):
             total = total + get(values.slope, (f0 + a) * most + c) * get(z, c)
         put(f, first + a, total)
+    if form > PRODUCT:
+        add_products(form - PRODUCT, d, first, z, f)
+        return
     for m in range(M):
         square = splat(0.0)
         for c in range(d):

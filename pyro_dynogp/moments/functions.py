@@ -1,11 +1,15 @@
 r"""Compiled evaluation of static functions inside a recursion, with derivatives.
 
-Two forms. A function of one channel is a table on an even grid, interpolated by cubic convolution
+Three forms. A function of one channel is a table on an even grid, interpolated by cubic convolution
 (Keys 1981, IEEE ASSP 29:1153; the parameter -1/2), held at its ends: any kernel fits, since the
 table is computed outside. A function of several channels is an expansion in a radial kernel,
 
     f_e(z) = constant_e + slope_e . z + sum_m weight_em kappa(r_m),
-    r_m^2 = sum_c ((z_c - Z_mc) s_c)^2.
+    r_m^2 = sum_c ((z_c - Z_mc) s_c)^2,
+
+or the products of each of its first k channels with each other one, form PRODUCT + k,
+
+    f_(i, j)(z) = constant_(i, j) + slope_(i, j) . z + z_i z_(k + j).
 """
 
 from __future__ import annotations
@@ -22,6 +26,7 @@ from pyro_dynogp.support.compiled import BORROWING
 # Forms of a static function.
 TABLE = 0
 KERNELS = {"rbf": 1, "matern12": 2, "matern32": 3, "matern52": 4}
+PRODUCT = 8
 
 
 @njit(**BORROWING)
@@ -117,14 +122,36 @@ class Expansion(NamedTuple):
 
 
 @njit(**BORROWING)
+def add_products(first, z, f):
+    """Add to f (e,) the products of the first channels of z (d,) with the others."""
+    others = z.shape[0] - first
+    for i in range(first):
+        for j in range(others):
+            f[i * others + j] += z[i] * z[first + j]
+
+
+@njit(**BORROWING)
+def products_adjoint(first, z, f_bar, z_bar):
+    """Add the gradient by z of the products to z_bar, given f_bar."""
+    others = z.shape[0] - first
+    for i in range(first):
+        for j in range(others):
+            z_bar[i] += f_bar[i * others + j] * z[first + j]
+            z_bar[first + j] += f_bar[i * others + j] * z[i]
+
+
+@njit(**BORROWING)
 def expansion(form, z, part, f):
-    """Write the outputs f (e,) of a radial expansion at z (d,)."""
+    """Write the outputs f (e,) of a radial expansion, or of products, at z (d,)."""
     e = f.shape[0]
     d = z.shape[0]
     for a in range(e):
         f[a] = part.constant[a]
         for c in range(d):
             f[a] += part.slope[a, c] * z[c]
+    if form > PRODUCT:
+        add_products(form - PRODUCT, z, f)
+        return
     for m in range(part.Z.shape[0]):
         square = 0.0
         for c in range(d):
@@ -146,6 +173,9 @@ def expansion_adjoint(form, z, part, f_bar, z_bar, bars):
         for c in range(d):
             bars.slope[a, c] += f_bar[a] * z[c]
             z_bar[c] += f_bar[a] * part.slope[a, c]
+    if form > PRODUCT:
+        products_adjoint(form - PRODUCT, z, f_bar, z_bar)
+        return
     for m in range(part.Z.shape[0]):
         square = 0.0
         for c in range(d):
@@ -165,6 +195,12 @@ def expansion_adjoint(form, z, part, f_bar, z_bar, bars):
             bars.inverse[c] += square_bar * difference * difference * inverse[c]
 
 
+def cubature(channels: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes (2 d, d) and weights (2 d,) for the standard normal, exact to the third degree."""
+    eye = math.sqrt(channels) * np.eye(channels)
+    return np.concatenate([eye, -eye]), np.full(2 * channels, 0.5 / channels)
+
+
 @lru_cache
 def gauss_hermite(channels: int) -> tuple[np.ndarray, np.ndarray]:
     """Nodes (Q, d) and weights (Q,) for the standard normal of d channels.
@@ -173,8 +209,7 @@ def gauss_hermite(channels: int) -> tuple[np.ndarray, np.ndarray]:
     five on the third-degree cubature of 2 d nodes, whose cost does not grow exponentially.
     """
     if channels >= 5:
-        eye = math.sqrt(channels) * np.eye(channels)
-        return np.concatenate([eye, -eye]), np.full(2 * channels, 0.5 / channels)
+        return cubature(channels)
     count = {1: 11, 2: 5, 3: 3, 4: 3}[channels]
     x, w = np.polynomial.hermite_e.hermegauss(count)
     w = w / w.sum()

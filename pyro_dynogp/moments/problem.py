@@ -17,7 +17,7 @@ from torch import Tensor
 from pyro_dynogp.lti.primitives import array, flatten_batch
 from pyro_dynogp.lti.primitives import run as run_recursion
 from pyro_dynogp.moments import filtering, reverse
-from pyro_dynogp.moments.functions import TABLE, gauss_hermite
+from pyro_dynogp.moments.functions import PRODUCT, TABLE, cubature, gauss_hermite
 from pyro_dynogp.moments.layout import Layout, Values, zero_bars
 from pyro_dynogp.support.tensors import broadcast
 
@@ -119,7 +119,11 @@ def make_layout(
     Args:
         measured: whether the last of them is what the outputs are, a function of one signal.
     """
-    sets = [gauss_hermite(d) for d in channels]
+    # Products of known signals with one that is normal are exact at the nodes of the third degree.
+    sets = [
+        cubature(d) if form > PRODUCT else gauss_hermite(d)
+        for d, form in zip(channels, forms, strict=True)
+    ]
     widest = max(channels, default=1)
     most = max((len(w) for _, w in sets), default=1)
     nodes = np.zeros((len(sets), most, widest))

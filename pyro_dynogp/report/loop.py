@@ -198,11 +198,11 @@ def _method_of(given: Fit, model: Model) -> dict[str, Any]:
         chains = int(given.diagnostics["chains"])
         warmup = int(given.diagnostics.get("warmup", WARMUP))  # older files do not say
         return {"method": "nuts", "chains": chains, "draws": count // chains, "warmup": warmup}
-    if given.method == "importance" and model.has_function == given.model.has_function:
+    if given.method == "importance" and model.learns_function == given.model.learns_function:
         return {"method": "importance", "draws": count}
     if given.method == "svi":
         options: dict[str, Any] = {"method": "svi", "draws": count}
-        if model.has_function == given.model.has_function and given.collapsed:
+        if model.learns_function == given.model.learns_function and given.collapsed:
             options["hyperparameters"] = family_of(given)
         return options
-    return {"method": "svi" if model.has_function else given.method}
+    return {"method": "svi" if model.learns_function else given.method}

@@ -14,6 +14,7 @@ from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.data.channels import Recorded
 from pyro_dynogp.discrepancy import trials
 from pyro_dynogp.discrepancy.held_out import held_out_density
+from pyro_dynogp.effects.nonlinear_feedback import NonlinearFeedbackOfOutput
 from pyro_dynogp.inference import refit as refits
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.optimise.maximum import maximise
@@ -260,6 +261,40 @@ def test_both_functions_together_are_fitted_where_one_of_them_helps_and_leaves_s
     tried = trials.run(trial)
     assert len(made) == fitted
     assert tried.model == models[kept]
+
+
+@pytest.mark.parametrize(
+    ("levels", "noise", "fitted"),
+    [
+        ((5.0, 9.0, 7.0, 8.0, 9.0), (), 5),
+        ((-3.0, 1.0, -2.0, -3.0, 9.0), (), 5),  # products are tried whatever functions do
+        ((-3.0, -1.0, -2.0, -3.0, 9.0), (), 4),  # both functions are not, where nothing helps
+        ((-3.0, 1.0, -2.0, 3.0, 9.0), (), 4),  # nor where products forecast better than either
+        ((5.0, 9.0, 20.0, 8.0, 9.0), (20.0,), 3),  # once one leaves noise alone the rest is not
+        ((5.0, 9.0, 7.0, 8.0, 9.0), (7.0,), 5),  # unless another one forecasts better
+        ((5.0, 9.0, 7.0, 8.0, 9.0), (9.0,), 2),
+    ],
+)
+def test_later_variants_are_fitted_one_by_one_while_something_is_left(
+    record, monkeypatch, levels, noise, fitted
+):
+    plain = dgp.LinearDynamicGP(1, pairs=1)
+    said = SimpleNamespace(where={"output": "y", "products": 0.9})
+    models = tuple(NonlinearFeedbackOfOutput().extend(plain, said, record))
+    assert len(models) == 5
+    made = []
+
+    def again(fit, training, *, model, run):
+        made.append(Made(model, levels[len(made)], records=(record,)))
+        return made[-1]
+
+    refitted_by(monkeypatch, again)
+    monkeypatch.setattr(trials, "_are_noise", lambda errors, fit: fit.level in noise)
+    fold = np.arange(N) >= TRAINING
+    trial = trials.Trial(models, record, (fold,), Made(plain, 0.0), 0, SETTINGS,
+                         compared="held out")  # fmt: skip
+    trials.run(trial)
+    assert [one.model for one in made] == list(models[:fitted])
 
 
 @pytest.mark.parametrize(

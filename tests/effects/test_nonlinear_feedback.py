@@ -17,13 +17,15 @@ from pyro_dynogp.effects.nonlinear_feedback import (
 )
 from pyro_dynogp.effects.output_nonlinearity import output_nonlinearity
 from pyro_dynogp.models.system import DynamicSystem
-from pyro_dynogp.models.variants import with_feedback
+from pyro_dynogp.models.variants import with_feedback, with_products
 from tests.discrepancy.made import SETTINGS, coloured, residuals_of, within_chance
+from tests.models.closed_loops import make_record
+from tests.models.test_known import values_at
 
 STEP, DAMPING, STIFFNESS = 0.05, 0.6, 4.0
 POLE = complex(-0.5 * DAMPING, np.sqrt(STIFFNESS - 0.25 * DAMPING**2))
 EFFECT = NonlinearFeedbackOfOutput()
-SAID = SimpleNamespace(sentence="What the test said.", where={"output": "x"})
+SAID = SimpleNamespace(sentence="What the test said.", where={"output": "x", "products": 0.6})
 
 
 def sprung(u, cubic):
@@ -66,7 +68,7 @@ class TestDetection:
         r = self.seen(0, 1.2)
         found = nonlinear_feedback(r, SETTINGS)
         assert found.p_value < 1e-4
-        assert found.where == {"output": "speed"}
+        assert found.where["output"] == "speed"
         assert "acts back on its dynamics" in found.sentence
         # To first order the poles make the residual; a function at once explains less.
         assert found.gain > output_nonlinearity(r, SETTINGS).gain + 10.0
@@ -139,13 +141,17 @@ class TestDetection:
 
 class TestBlock:
     def test_functions_see_the_output_a_hidden_signal_or_both_and_come_back(self, spring):
-        variants = EFFECT.extend(dgp.LinearDynamicGP(1, pairs=2), None, spring)
+        variants = EFFECT.extend(dgp.LinearDynamicGP(1, pairs=2), SAID, spring)
         wired = [{w.name: (w.sources, w.feedback) for w in model.wires} for model in variants]
         output, hidden = (("g",), ()), (("g_hidden",), ())
         unseen = ("hidden_feedback", "feedback_step")
         assert wired == [
             {"g": (("inputs",), ("feedback",)), "feedback": output},
             {"g": (("inputs",), unseen), **dict.fromkeys(unseen, hidden)},
+            {"g": (("inputs",), ("feedback_product",)),
+             "feedback_product": (("inputs", "g"), ())},
+            {"g": (("inputs",), ("hidden_product",)),
+             "hidden_product": (("inputs", "g_hidden"), ())},
             {"g": (("inputs",), ("feedback", *unseen)), "feedback": output,
              **dict.fromkeys(unseen, hidden)},
         ]  # fmt: skip
@@ -157,31 +163,64 @@ class TestBlock:
             "What the test said.",
             "A nonlinear function of a signal of the dynamics of 'x' that is not measured acts "
             "back on them.",
+            "Inputs times 'x' act back on its dynamics.",
+            "Inputs times a signal of the dynamics of 'x' that is not measured act back on its "
+            "dynamics.",
             "Nonlinear functions of 'x', and of a signal of the dynamics of 'x' that is not "
             "measured, act back on them.",
         ]
 
+    @pytest.mark.parametrize(
+        ("share", "leading"),
+        [
+            (1.0, ["feedback_product", "hidden_product", "feedback", "hidden_feedback"]),
+            (0.99, ["feedback", "hidden_feedback", "feedback_product", "hidden_product"]),
+            (0.5, ["feedback", "hidden_feedback", "feedback_product", "hidden_product"]),
+            (0.49, ["feedback", "hidden_feedback"]),
+        ],
+    )
+    def test_products_are_tried_by_what_the_test_says_of_them(self, spring, share, leading):
+        said = SimpleNamespace(where={"output": "x", "products": share})
+        made = EFFECT.extend(dgp.LinearDynamicGP(1), said, spring)
+        assert [one.dynamic[0][0].feedback[0] for one in made] == [*leading, "feedback"]
+        assert made[-1].dynamic[0][0].feedback == (
+            "feedback", "hidden_feedback", "feedback_step"
+        )  # fmt: skip
+
+    def test_of_functions_and_products_both_are_said(self):
+        model = with_products(with_feedback(dgp.LinearDynamicGP(1)))
+        assert EFFECT.sentence(SAID, model) == (
+            "What the test said. Inputs times 'x' act back on its dynamics."
+        )
+
     def test_what_is_there_is_not_added_again(self, spring):
         """To a function of the output one of a hidden signal, and the other way round."""
-        first, second, both = EFFECT.extend(dgp.LinearDynamicGP(1), None, spring)
+        first, second, product, hidden, both = EFFECT.extend(dgp.LinearDynamicGP(1), SAID, spring)
+        back = {"feedback", "hidden_feedback", "feedback_step"}
+        products = [{"feedback_product"}, {"hidden_product"}]
         for model in (first, second):
-            (more,) = EFFECT.extend(model, None, spring)
-            back = {"feedback", "hidden_feedback", "feedback_step"}
-            assert set(more.dynamic[0][0].feedback) == back
-            assert more.dynamic[0][1].hidden == 1
-        assert EFFECT.extend(both, None, spring) == []
-        (own,) = EFFECT.extend(dgp.NonlinearFeedback(1), None, spring)
+            own = set(model.dynamic[0][0].feedback)
+            more = EFFECT.extend(model, SAID, spring)
+            made = [set(one.dynamic[0][0].feedback) for one in more]
+            assert made == [back, own | products[0], own | products[1]]
+            assert more[0].dynamic[0][1].hidden == 1
+        assert len(EFFECT.extend(both, SAID, spring)) == 2
+        assert len(EFFECT.extend(product, SAID, spring)) == 4
+        for model in (product, hidden):
+            assert model not in EFFECT.extend(model, SAID, spring)
+        own, *_ = EFFECT.extend(dgp.NonlinearFeedback(1), SAID, spring)
         assert own.dynamic[0][0].feedback == ("f", "hidden_feedback", "feedback_step")
-        assert EFFECT.extend(dgp.NonlinearFeedback(1, hidden=2), None, spring) == []
+        more = EFFECT.extend(dgp.NonlinearFeedback(1, hidden=2), SAID, spring)
+        assert [set(one.dynamic[0][0].feedback[2:]) for one in more] == products
 
     def test_a_function_before_the_dynamics_stays(self, spring):
-        for model in EFFECT.extend(dgp.Hammerstein(1), None, spring):
+        for model in EFFECT.extend(dgp.Hammerstein(1), SAID, spring):
             assert [wire.name for wire in model.wires if wire.feedback] == ["g"]
             assert model.wires[0].name == "f"
             assert model.output_wire.name == "g"
 
     def test_a_sensor_stays_behind_the_loop(self, spring):
-        for model in EFFECT.extend(dgp.Wiener(1), None, spring):
+        for model in EFFECT.extend(dgp.Wiener(1), SAID, spring):
             wires = {wire.name: wire for wire in model.wires}
             assert wires["g"].feedback
             assert model.output_wire.name == "f"
@@ -204,7 +243,7 @@ class TestBlock:
         ids=["feedback of another layer", "heavy tails", "noise of the output"],
     )
     def test_elsewhere_there_is_no_such_block(self, model, spring):
-        assert EFFECT.extend(model, None, spring) == []
+        assert EFFECT.extend(model, SAID, spring) == []
         assert with_feedback(model) is None
 
 
@@ -212,7 +251,7 @@ class TestNumbers:
     def test_slopes_of_a_spring(self, spring):
         fit = dgp.fit(dgp.NonlinearFeedback(1), spring, method="map", restarts=1, workers=1,
                       progress=False)  # fmt: skip
-        found = EFFECT.parameters(fit, None, spring)
+        found = EFFECT.parameters(fit, SAID, spring)
         assert list(found) == [
             f"inverse steady-state gain of force, {part} [N/mm]"
             for part in ("low end", "middle", "high end")
@@ -247,7 +286,7 @@ class TestNumbers:
 
     def test_none_for_what_has_no_steady_state(self, spring):
         line = SimpleNamespace(model=dgp.LinearDynamicGP(1), scaling=None)
-        assert EFFECT.parameters(line, None, spring) == {}
+        assert EFFECT.parameters(line, SAID, spring) == {}
 
     @pytest.mark.parametrize(
         ("slopes", "words"),
@@ -284,3 +323,82 @@ def test_the_loop_names_a_spring(spring):
     assert report.effects[0].ties == ()
     assert report.effects[0].sentence.endswith("It hardens to both ends.")
     assert report.after["rmse"] < 0.3 * report.before["rmse"]
+
+
+def carried(seed, n=400, strength=0.8):
+    """Heat, flow and temperature of x' = 1 + w - x + u (strength x + 0.2); noise of 2 %."""
+    rng = np.random.default_rng(seed)
+    w = np.repeat(rng.standard_normal(n // 5), 5)
+    u = np.repeat(np.clip(0.5 * rng.standard_normal(n // 8), -0.9, 0.9), 8)
+    x, y = 1.0, np.empty(n)
+    for k in range(n):
+        y[k] = x
+        for _ in range(10):
+            x += 0.01 * (1.0 + w[k] - x + u[k] * (strength * x + 0.2))
+    y += 0.02 * y.std() * rng.standard_normal(n)
+    return dgp.Record(0.1 * np.arange(n), np.column_stack([w, u]), y[:, None],
+                      input_names=("heat", "flow"), time_unit="s")  # fmt: skip
+
+
+class TestProducts:
+    """A flow that carries heat with it: an input times the output."""
+
+    @pytest.mark.parametrize("one_step", [True, False])
+    def test_they_are_found_in_free_runs_and_one_step_ahead(self, one_step):
+        """Functions of the temperature alone say little of it."""
+        record = carried(0)
+        fit = dgp.fit(
+            dgp.LinearDynamicGP(2, pairs=1), record[:250], method="map", workers=1, progress=False
+        )
+        r = residuals.residuals_of(fit, record, settings=SETTINGS)
+        r = dataclasses.replace(r, linear=one_step)
+        found = nonlinear_feedback(r, SETTINGS)
+        assert found.p_value < 1e-6
+        assert found.where["products"] == 1.0
+        still = nonlinear_feedback(dataclasses.replace(r, inputs=r.inputs[:, :1]), SETTINGS)
+        assert still.p_value > 1e4 * found.p_value
+        assert still.where["products"] < 1.0
+        none = nonlinear_feedback(dataclasses.replace(r, inputs=r.inputs[:, :0]), SETTINGS)
+        assert none.where["products"] == 0.0
+
+    def test_poles_where_an_input_is_low_and_where_it_is_high(self):
+        """Rates of 1 - 0.8 u, of which u varies from -0.9 to 0.9."""
+        record = carried(1, 800)
+        model = with_products(dgp.LinearDynamicGP(2, pairs=1, process_noise=False))
+        fit = dgp.fit(model, record, method="map", restarts=2, workers=1, progress=False)
+        found = EFFECT.parameters(fit, None, record)
+        assert list(found) == [
+            f"decay rate of the dominant mode at {end} flow [1/s]" for end in ("low", "high")
+        ]
+        low, high = np.quantile(record.inputs[:, 1], (0.02, 0.98))
+        for (mean, sd), u in zip(found.values(), (low, high), strict=True):
+            assert 0.0 < sd < 0.15
+            assert abs(mean - (1.0 - 0.8 * u)) < 3.0 * sd
+        assert EFFECT.shape(found) == ""
+        both = SimpleNamespace(model=with_feedback(model), scaling=fit.scaling)
+        assert EFFECT.parameters(both, None, record) == {}
+
+    @pytest.mark.parametrize("hidden", [False, True])
+    def test_rates_are_those_of_the_matrix_with_the_input_held(self, hidden):
+        record = make_record(1, missing=False)
+        model = with_products(dgp.LinearDynamicGP(1, pairs=2), hidden=hidden).scaled_to(record)
+        values = {k: v.unsqueeze(0) for k, v in values_at(model, 0).items()}
+        system = model.system(values, model.scaling)
+        fit = SimpleNamespace(model=model, scaling=model.scaling, draws=values, method="svi",
+                              system_at=lambda _: system)  # fmt: skip
+        found = EFFECT.parameters(fit, None, record)
+        modes = system.layer("g").modes
+        poles, F, C = modes.poles[0].numpy(), modes.B[0, :, -1].numpy(), modes.C[0].numpy()
+        C = np.atleast_2d(C)[-1]
+        low, high = np.quantile(record.inputs[:, 0], (0.02, 0.98))
+        for (mean, sd), u in zip(found.values(), (low, high), strict=True):
+            u = float(((u - model.scaling.input_offset) / model.scaling.input_scale)[0])
+            A = np.diag(np.concatenate([poles, poles.conj()]))
+            A = A + u * np.outer(np.r_[F, F.conj()], np.r_[C, C.conj()])
+            # Of the step response to what comes back, by the modes that are there at its end.
+            roots, V = np.linalg.eig(A)
+            share = np.r_[C, C.conj()] @ V * np.linalg.solve(V, np.r_[F, F.conj()]) / roots
+            steady = np.r_[C, C.conj()] @ np.linalg.solve(A, np.r_[F, F.conj()])
+            assert share.sum() == pytest.approx(steady)
+            assert mean == pytest.approx(-roots[np.abs(share).argmax()].real)
+            assert sd == 0.0

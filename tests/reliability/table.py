@@ -197,6 +197,17 @@ def of_model(layer, **options):
     return made
 
 
+def of_product():
+    """A product of the input and the output, which comes back."""
+
+    def made(**arguments):
+        given = {"sees": ("inputs", "g"), "name": "f", **arguments}
+        loop = dgp.Dynamic(pairs=1, feedback=("f",))
+        return dgp.Cascade(1, [loop, dgp.Product(**given)], output="g")
+
+    return made
+
+
 TABLE: dict[str, Entry] = {
     "LinearDynamicGP": plain(dgp.LinearDynamicGP, {**LAYER, "noise": NAME, "brownian": COUNT,
                              "feedthrough": SWITCH, "integrators": BOTH}, inputs=1, pairs=1),
@@ -232,6 +243,8 @@ TABLE: dict[str, Entry] = {
         "function": (3, None, "text"), "parameters": (3, {"a": 3}, {3: None}), "outputs": COUNT,
         "range": ((1.0, 0.0), 3, "text", (0.0, np.nan)), "scaled": SWITCH, "skip": (("x",), 3),
         "sees": (("x",), 3), "name": ("y", 3)}),
+    "Product": plain(of_product(), {"first": COUNT, "others": COUNT, "skip": (("x",), 3),
+                                  "sees": (("x",), 3), "name": ("y", 3)}),
     "Step": plain(of_model(dgp.Step), {"skip": (("x",), 3), "sees": (("x",), 3),
                                        "name": ("y", 3)}),
     "Gaussian": plain(dgp.Gaussian, {}),

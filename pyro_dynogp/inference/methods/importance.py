@@ -41,7 +41,8 @@ class Importance:
     Annealing takes about as long as the climbs or longer, and matters less the longer a record is.
     Along more than `longest` samples, where k asks for it, the fit is the posterior mode instead.
     Models with static functions have along more than `longest` samples the posterior that `Normal`
-    gives: inducing values and first states alone have draws, all else stays at its optimum.
+    gives: inducing values and first states alone have draws, all else stays at its optimum. Without
+    functions to learn (`Product`) it is a normal of all parameters, where k asks for another one.
 
     Attributes:
         draws: posterior draws to keep, of equal weight.
@@ -90,8 +91,9 @@ def with_draws_around(
     longest: int | None = None,
 ) -> Fitted:
     """The fit that draws around several optima, the best first, are."""
-    longest = longest or (LONGEST_FEEDBACK if problem.model.has_feedback else LONGEST)
-    if problem.model.has_function:
+    model = problem.model
+    longest = longest or (LONGEST_FEEDBACK if model.has_feedback else LONGEST)
+    if model.learns_function:
         return _of_functions(problem, optima, run, draws, longest)
     found = sample_around(
         problem.target,
@@ -102,6 +104,8 @@ def with_draws_around(
         progress=run.progress,
     )
     failed = not found.annealed and not found.trusted
+    if failed and model.has_function:
+        return _of_functions(problem, optima, run, draws, longest)
     if failed and samples_of(problem.records) > longest:
         mode = at_optimum(problem.model, optima, run.seed, problem.records)
         return replace(mode, diagnostics=FrozenMapping({**mode.diagnostics, "pareto_k": found.k}))

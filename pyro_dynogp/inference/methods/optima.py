@@ -110,7 +110,7 @@ class Normal:
     def check(self, model: Model, *, warm: bool) -> None:
         """Refuse "map" for a model in which nothing would be free, and unsuitable optimizers."""
         check_optimizer(self.optimizer, model)
-        if self.family == "map" and not model.has_function and not model.collapsed.state_sites:
+        if self.family == "map" and not model.learns_function and not model.collapsed.state_sites:
             raise invalid(
                 "hyperparameters",
                 expected="'normal' or 'multivariate normal' for a cascade without static layers",
@@ -121,7 +121,7 @@ class Normal:
         """The family, where "auto" leaves it to the model."""
         if self.family != "auto":
             return self.family
-        return "map" if model.has_function else "multivariate normal"
+        return "map" if model.learns_function else "multivariate normal"
 
     def __call__(self, problem: Problem, run: Run) -> Fitted:
         """The normals around the best optima, and draws of them."""

@@ -1,0 +1,245 @@
+"""Products in feedback: bilinear systems, against a dense Kalman filter, saved and copied."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+import torch
+
+import pyro_dynogp as dgp
+from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.models.outputs import output_process
+from pyro_dynogp.models.product import Products, factors, is_product
+from pyro_dynogp.models.variants import with_feedback, with_products
+from tests.models.closed_loops import ClosedLoop, check_gradient, make_record, system_at
+from tests.models.test_known import values_at as any_values_at
+
+CASES = pytest.mark.parametrize(
+    ("inputs", "outputs", "hidden", "irregular"),
+    [(1, 1, False, False), (3, 1, False, True), (2, 2, False, False), (2, 1, True, False)],
+)
+
+
+def values_at(model, seed):
+    """Values of all sites at random; with more feedback inputs would make the system unstable."""
+    values = any_values_at(model, seed)
+    values["g_input_gain"][:, model.inputs :] *= 0.05
+    return values
+
+
+class BilinearLoop(ClosedLoop):
+    """x[k + 1] = (Phi + sum_ij Gamma_ij u_i[k] C_j) x[k] + drive_k + noise, in numpy."""
+
+    def __init__(self, model, system, record, hidden):
+        modes = system.layer("g").modes
+        d, count = model.inputs, 1 if hidden else model.outputs
+        lam = np.concatenate([modes.poles.numpy(), modes.poles.numpy().conj()])
+        B = np.concatenate([modes.B.numpy(), modes.B.numpy().conj()])
+        C = np.concatenate([modes.C.numpy(), modes.C.numpy().conj()], -1)[-count:]
+        D = modes.D.numpy()[-count:, :d]
+        offset = np.zeros(count) if hidden else system.offset.numpy()
+        scaling, n_y = model.scaling, model.outputs
+        u = (record.inputs - scaling.input_offset) / scaling.input_scale
+        L = np.concatenate([modes.noise_gain.numpy(), modes.noise_gain.numpy().conj()])
+        rates = lam[:, None] + lam.conj()[None]
+        sigma = -(L @ L.conj().T) / rates
+        self.F, self.drive, self.Q = [], [], []
+        for k, step in enumerate(np.diff(record.time)):
+            gain = (np.expm1(lam * step) / lam)[:, None] * B
+            back = gain[:, d:].reshape(-1, d, count)
+            along = np.einsum("pij,i->pj", back, u[k])
+            self.F.append(np.diag(np.exp(lam * step)) + along @ C)
+            self.drive.append(gain[:, :d] @ u[k] + along @ (D @ u[k] + offset))
+            self.Q.append(-sigma * np.expm1(rates * step))
+        self.H = np.concatenate([modes.C.numpy(), modes.C.numpy().conj()], -1)[:n_y]
+        self.level = u @ modes.D.numpy()[:n_y, :d].T + system.offset.numpy()
+        first = system.layer("g").first_state.numpy()
+        self.m0, self.P0 = np.concatenate([first, first.conj()]), sigma
+        self.noise = system.noise.constant_sd.numpy() ** 2
+        self.scale, self.shift = scaling.output_scale, scaling.output_offset
+
+
+def bilinear(inputs=1, outputs=1, hidden=False):
+    model = with_products(dgp.LinearDynamicGP(inputs, outputs=outputs, pairs=2), hidden=hidden)
+    ((_, layer),) = model.dynamic
+    return dgp.Cascade(
+        inputs, (layer.__class__(**{**vars(layer), "substeps": 1}), *model.layers[1:]),
+        output=model.output,
+    )  # fmt: skip
+
+
+@CASES
+def test_it_is_the_kalman_filter_of_the_bilinear_system(inputs, outputs, hidden, irregular):
+    """Given the inputs the system is linear, if another one at every sample."""
+    record = make_record(inputs, outputs, irregular=irregular)
+    model = bilinear(inputs, outputs, hidden).scaled_to(record)
+    for seed in range(3):
+        system = system_at(model, values_at(model, seed))
+        dense = BilinearLoop(model, system, record, hidden)
+        y = dense.scaled(record.outputs)
+        expected, means, covariances = dense.filter(y)
+        (prepared,) = model.prepare(record)
+        process = output_process(system, prepared)
+        there = ~np.isnan(y)
+        found = float(process.log_prob(prepared.observations))
+        logs = np.log(dense.scale) @ there.sum(0)
+        assert found == pytest.approx(expected - logs, rel=1e-8, abs=1e-7)
+        ahead = process.one_step(prepared.observations)
+        mean = dense.scaled(ahead.mean.numpy().reshape(y.shape))
+        first = there[:, 0]  # later outputs are foretold given the first
+        np.testing.assert_allclose(mean[first, 0], means[first, 0], rtol=1e-7, atol=1e-8)
+        variance = ahead.variance.numpy().reshape(y.shape)[first, 0] / dense.scale[0] ** 2
+        expected = covariances[first, 0, 0] + dense.noise[0]
+        np.testing.assert_allclose(variance, expected, rtol=1e-7, atol=1e-9)
+
+
+@CASES
+def test_gradient_is_that_of_finite_differences(inputs, outputs, hidden, irregular):
+    record = make_record(inputs, outputs, n=25, irregular=irregular)
+    model = bilinear(inputs, outputs, hidden).scaled_to(record)
+    check_gradient(Potential(model, (model.prepare(record),), values_at(model, 0)))
+
+
+def test_points_side_by_side_are_those_one_by_one():
+    record = make_record(2)
+    model = bilinear(2).scaled_to(record)
+    points = [values_at(model, seed) for seed in range(5)]
+    potential = Potential(model, (model.prepare(record),), points[0])
+    alone = [float(potential.energies_at([point])[0]) for point in points]
+    np.testing.assert_allclose(potential.energies_at(points), alone, rtol=1e-10)
+
+
+def test_layers_drawn_as_sites_are_multiplied_alike():
+    """Of inputs alone it is a layer before the dynamics: no filter, the same products."""
+    record = make_record(2)
+    model = dgp.Cascade(2, (dgp.Product(sees=("inputs",)), dgp.Dynamic(pairs=1))).scaled_to(record)
+    system = system_at(model, values_at(model, 0))
+    u = (record.inputs - model.scaling.input_offset) / model.scaling.input_scale
+    found = system.layer("f").function.mean(torch.from_numpy(u))
+    np.testing.assert_allclose(found[:, 0], u[:, 0] * u[:, 1])
+
+
+@pytest.mark.parametrize("site", ["g_input_gain", "offset", "g_log_decay"])
+def test_sites_matter_to_the_products(site):
+    record = make_record()
+    model = bilinear().scaled_to(record)
+    values = values_at(model, 0)
+    (prepared,) = model.prepare(record)
+
+    def density(given):
+        return float(output_process(system_at(model, given), prepared).log_prob(
+            prepared.observations))  # fmt: skip
+
+    moved = values | {site: values[site] + 0.1}
+    if site == "g_input_gain":  # of what comes back alone
+        moved[site][:, 0] = values[site][:, 0]
+    assert abs(density(moved) - density(values)) > 1e-4
+
+
+def test_each_of_the_first_is_multiplied_with_each_of_the_others():
+    layer = dgp.Product(2, 3)
+    assert (layer.outputs, factors(layer), is_product(layer)) == (6, 2, True)
+    signals = [torch.full((4,), x) for x in (2.0, 3.0, 5.0, 7.0, 11.0)]
+    assert layer.function(*signals)[0].tolist() == [10.0, 14.0, 22.0, 15.0, 21.0, 33.0]
+    assert dgp.Product().function(*signals[:2]).tolist() == [6.0] * 4
+    for other in (dgp.Step(), dgp.Static(), dgp.Known(torch.mul)):
+        assert (factors(other), is_product(other)) == (0, False)
+
+
+def test_copies_and_files_have_the_same_layer(tmp_path):
+    layer = dgp.Product(2, sees=("inputs", "g"), name="heat")
+    for twin in (copy.deepcopy(layer), pickle.loads(pickle.dumps(layer)),
+                 dgp.Product(2, sees=("inputs", "g"), name="heat")):  # fmt: skip
+        assert twin == layer
+    assert layer != dgp.Product(1, 2, sees=("inputs", "g"), name="heat")
+    record = make_record(2, missing=False)
+    fit = dgp.fit(bilinear(2), record, method="map", restarts=1, steps=3, workers=1,
+                  progress=False)  # fmt: skip
+    fit.save(tmp_path / "heat.fit")
+    again = dgp.load(tmp_path / "heat.fit")
+    assert again.model == fit.model
+    assert isinstance(again.model.layers[1].function, Products)
+    assert "product, 2 outputs" in fit.summary()
+    run = fit.simulate(record).mean
+    np.testing.assert_array_equal(again.simulate(record).mean, run)
+
+
+@pytest.mark.parametrize(
+    ("sees", "first", "others", "got"),
+    [(("inputs", "g"), 1, 1, "3 signals"), (("g",), 1, 1, "1 signals"),
+     (("inputs", "g"), 1, 3, "3 signals")],
+)  # fmt: skip
+def test_as_many_signals_as_it_multiplies(sees, first, others, got):
+    layers = (dgp.Dynamic(feedback=("f",)), dgp.Product(first, others, sees=sees))
+    with pytest.raises(ValueError, match=f"layer 'f': expected {first} signals.*{got}"):
+        dgp.Cascade(2, layers, output="g")
+
+
+def test_in_the_filter_the_first_are_inputs_or_functions_of_inputs():
+    record = make_record(1, missing=False)
+    loop = dgp.Dynamic(pairs=1, feedback=("f",), name="g")
+    for signals, right in (((), True), (("g0",), False)):
+        bent = dgp.Static(inducing=4, sees=("inputs",), name="bent")
+        first = dgp.Dynamic(pairs=1, name="g0", sees=("inputs",))
+        product = dgp.Product(sees=(*(signals or ("bent",)), "g"), name="f")
+        layers = (bent, first, dgp.Dynamic(**{**vars(loop), "sees": ("bent", "g0")}), product)
+        model = dgp.Cascade(1, layers, output="g", integrate="all").scaled_to(record)
+        (prepared,) = model.prepare(record)
+        system = system_at(model, any_values_at(model, 0))
+        if right:
+            found = output_process(system, prepared).log_prob(prepared.observations)
+            assert bool(found.isfinite())
+            continue
+        with pytest.raises(ValueError, match="expected inputs, or functions of inputs alone"):
+            output_process(system, prepared).log_prob(prepared.observations)
+
+
+@pytest.mark.parametrize("bad", [0, -1, 1.5, "two", None])
+@pytest.mark.parametrize("argument", ["first", "others"])
+def test_numbers_of_signals_are_whole(argument, bad):
+    with pytest.raises(ValueError, match=f"{argument}: expected a whole number"):
+        dgp.Product(**{argument: bad})
+
+
+class TestVariants:
+    def test_the_loop_multiplies_inputs_with_the_output_or_a_hidden_signal(self):
+        for outputs, hidden, sees in ((1, False, "g"), (2, False, "g"), (2, True, "g_hidden")):
+            model = with_products(dgp.LinearDynamicGP(3, outputs=outputs), hidden=hidden)
+            (product,) = model.dynamic[0][0].feedback
+            wire = next(w for w in model.wires if w.name == product)
+            assert wire.sources == ("inputs", sees)
+            assert wire.layer.outputs == 3 * (1 if hidden else outputs)
+            assert model.substeps == 3  # what multiplies changes within a step
+            assert model.dynamic[0][1].hidden == int(hidden)
+
+    def test_functions_that_act_back_stay(self):
+        spring = with_feedback(dgp.LinearDynamicGP(1))
+        both = with_products(spring)
+        assert both.dynamic[0][0].feedback == ("feedback", "feedback_product")
+        assert with_products(both) is None
+        more = with_products(both, hidden=True)
+        assert more.dynamic[0][0].feedback == ("feedback", "feedback_product", "hidden_product")
+
+    def test_without_inputs_there_is_nothing_to_multiply(self):
+        assert with_products(dgp.LinearDynamicGP(0)) is None
+        heavy = dgp.LinearDynamicGP(1, likelihood=dgp.StudentT(4))
+        assert with_products(heavy) is None
+
+
+@pytest.mark.parametrize(("n", "method"), [(120, "importance"), (240, "svi")])
+def test_without_functions_to_learn_draws_are_of_all_parameters(n, method):
+    """Where functions are learnt, with feedback along 150 samples or fewer alone."""
+    rng = np.random.default_rng(0)
+    u = np.repeat(np.clip(0.5 * rng.standard_normal(n // 5), -0.9, 0.9), 5)
+    x, y = 1.0, []
+    for k in range(n):
+        y.append(x)
+        x += 0.1 * (1.0 + u[k] - x + 0.8 * u[k] * x)
+    y = np.array(y) + 0.01 * rng.standard_normal(n)
+    record = dgp.Record(0.1 * np.arange(n), u[:, None], y[:, None])
+    model = with_products(dgp.LinearDynamicGP(1, pairs=1, process_noise=False))
+    fit = dgp.fit(model, record, workers=1, progress=False)
+    assert fit.method == method
+    assert float(fit.draws["g_input_gain"].std(0).min()) > 1e-4
+    assert fit.noise_sd == pytest.approx(0.01, rel=0.2)
