@@ -14,7 +14,9 @@ from pyro_dynogp.discrepancy.judged import Judged, kind_of
 from pyro_dynogp.discrepancy.refits import Refits
 from pyro_dynogp.discrepancy.result import Attempt
 from pyro_dynogp.discrepancy.search import Candidate, Found
+from pyro_dynogp.discrepancy.trials import VERY_STRONG
 from pyro_dynogp.fitting import Fit
+from pyro_dynogp.inference.schwarz import counted, log_evidence_of
 from pyro_dynogp.models.variants import Model
 from pyro_dynogp.statistics.settings import LoopSettings
 
@@ -99,6 +101,7 @@ def confirm(
             break
         best = _best([one for one in playing if not one.tried.failure])
         equal = [k for k, one in enumerate(playing) if one is best or _ties(one, best, settings)]
+        equal = _needed(equal, playing)
         winner = better[_chosen(better, playing, equal, level)]
         fair = refits.against_refit(winner)
         judged = [fair if one is winner else one for one in judged]
@@ -146,6 +149,31 @@ def _cut_short(
         if id(found) not in tried
     ]
     return Confirmed(tuple(attempts), None, refits.model, None, None, None, (), early=True)
+
+
+def _needed(equal: Sequence[int], playing: Sequence[Judged]) -> list[int]:
+    """Of those that explain as much the ones that training data do not find too stiff."""
+
+    def stiff(k: int) -> bool:
+        return any(_needs_more(playing[k], playing[j]) for j in equal if j != k)
+
+    return [k for k in equal if not stiff(k)]
+
+
+def _needs_more(own: Judged, other: Judged) -> bool:
+    """Whether there is very strong evidence for another candidate that has more parameters.
+
+    In the data that both are fitted to, by Laplace's approximation, less what it loses of the data
+    held out: forecasts of a short block differ by chance.
+    """
+    fit, larger = own.tried.fit, other.tried.fit
+    if fit is None or larger is None:
+        return False
+    (fewer, measured), (more, same) = counted(fit), counted(larger)
+    if measured != same or more <= fewer:
+        return False
+    lost = min(other.attempt.gain - own.attempt.gain, 0.0)
+    return log_evidence_of(larger) - log_evidence_of(fit) + lost > VERY_STRONG
 
 
 def _chosen(

@@ -1,10 +1,12 @@
-"""Evidence of posterior modes by Schwarz's criterion."""
+"""Evidence of posterior modes: by Schwarz's criterion, and by Laplace's approximation."""
 
 from __future__ import annotations
 
 import math
 
+from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.fitted import Fitted
+from pyro_dynogp.inference.laplace import log_evidence
 
 
 def energy(fit: Fitted) -> float:
@@ -26,3 +28,13 @@ def log_bayes_factor(one: Fitted, other: Fitted) -> float:
     """
     (numbers, measured), (fewer, _) = counted(one), counted(other)
     return energy(other) - energy(one) - 0.5 * (numbers - fewer) * math.log(measured)
+
+
+def log_evidence_of(fit: Fitted) -> float:
+    """Log p(y) of the data that a mode is fitted to, as far as its neighbourhood goes [nats].
+
+    Schwarz's criterion pays for every inducing value of a function as for a parameter of its own,
+    which most of them are not.
+    """
+    model = fit.model.collapsed
+    return log_evidence(Potential(model, (model.prepare(fit.records),), fit.mode), fit.mode)
