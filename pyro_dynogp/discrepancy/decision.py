@@ -181,12 +181,14 @@ def _chosen(
 ) -> int:
     """Which of several that explain as much is added: the one that leaves least open.
 
-    Of effects that are one block of the model that which leaves least open gives it its name, if
-    the residual is certain of it, else the most probable one.
+    Of those of which the residual is certain, where there are such: what it hardly speaks for may
+    stand for them. Of effects that are one block of the model that which leaves least open gives it
+    its name, if the residual is certain of it, else the most probable one.
     """
     first: dict[str, int] = {}
     well = {better[k].found.effect.name for k in equal}
-    named = [k for k in equal if not _too_special(better[k].found, well, level)]
+    named = [k for k in equal if better[k].found.q_value <= level]
+    named = named or [k for k in equal if not _too_special(better[k].found, well, level)]
     for k in sorted(named, key=lambda k: _specific(better[k].found, level)):
         first.setdefault(repr(playing[k].tried.model), k)
     return min(

@@ -11,7 +11,7 @@ import pyro_dynogp as dgp
 from pyro_dynogp import effects
 from pyro_dynogp.discrepancy import decision
 from tests.discrepancy.made import SETTINGS
-from tests.discrepancy.test_decision import spoken_for
+from tests.discrepancy.test_decision import helping, spoken_for
 
 RECORD = SimpleNamespace(missing=np.zeros((100, 1), dtype=bool))
 SHORT = SimpleNamespace(missing=np.zeros((99, 1), dtype=bool))
@@ -56,6 +56,17 @@ def test_only_ties_count(known):
     best = one(12.0, 30.0, 8)
     assert decision._needed([0], [STIFF, best]) == [0]
     assert decision._needed([0, 2], [STIFF, best, one(11.0, 1.0, 3)]) == [0, 2]
+
+
+@pytest.mark.parametrize(("q", "name"), [(0.06, "periodic disturbance"), (0.04, "drift")])
+def test_what_the_residual_is_certain_of_comes_before_what_leaves_less_open(q, name):
+    """A hum lets tests of a drift nearly reject, and a drift takes up some of it."""
+    drift = helping(effects.Drift(), 0.2 * q, q)
+    hum = helping(effects.PeriodicDisturbance(), 1e-9, 1e-8, gain=52.0)
+    hum = replace(hum, tried=replace(hum.tried, model=dgp.LinearDynamicGP(1, pairs=2)))
+    assert drift.found.effect.freedom < hum.found.effect.freedom
+    for both in ([drift, hum], [hum, drift]):
+        assert both[decision._chosen(both, both, [0, 1], 0.05)].found.effect.name == name
 
 
 def test_a_wind_that_acts_by_its_square_is_no_dead_zone():
