@@ -35,7 +35,7 @@ LINES = 31_500
 # two files of their own for evidence and for noise of starts (10 lines), products in feedback (390
 # lines, of which tests are 250), and ties that training data decide (110 lines).
 # To shrink.
-LINES_TODAY = 53_321
+LINES_TODAY = 53_330
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

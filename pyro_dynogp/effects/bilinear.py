@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.criticism.posterior_draws import draws_of
+from pyro_dynogp.data.channels import prepared
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.effects.base import Parameters
 from pyro_dynogp.models.product import factors
@@ -42,7 +43,7 @@ def dominant_rates(fit: Fit, fed: Wire, record: Record) -> Parameters:
 
     Args:
         fit: of a model whose dynamics get products alone back. fed: the layer that gets them.
-        record: whose inputs are low and high.
+        record: whose inputs are low and high, without the model's channels.
     """
     known = fit.draws
     if fit.method == "map":  # a mode has none
@@ -59,9 +60,10 @@ def dominant_rates(fit: Fit, fed: Wire, record: Record) -> Parameters:
     F = dynamic.modes.B[..., fed.channels :]
     F = F.reshape(*F.shape[:-1], inputs, -1)
     poles = dynamic.modes.poles
+    given = prepared(record, fit.model.channels).inputs
     found: list[tuple[float, Parameters]] = []
     for place in range(inputs):
-        at = np.quantile(record.inputs[:, place], list(ENDS.values()))
+        at = np.quantile(given[:, place], list(ENDS.values()))
         low, high = (
             _dominant(poles, F[..., place, :], C, float(u))
             for u in (at - scaling.input_offset[place]) / scaling.input_scale[place]

@@ -80,7 +80,8 @@ def nonlinear_feedback(residuals: Residuals, settings: LoopSettings, *, seed: in
         best = replace(best, p_value=min(1.0, 2.0 * best.p_value))
     share = 0.0
     if r.inputs.shape[1]:
-        share = float(np.clip(best.gains[-r.inputs.shape[1] :].max() / best.gain, 0.0, 1.0))
+        most = max(best.gain, np.finfo(float).tiny)
+        share = float(np.clip(best.gains[-r.inputs.shape[1] :].max() / most, 0.0, 1.0))
     label = labelled(f"simulated {r.output_name}", r.output_unit)
     return evidence(
         "nonlinear feedback",

@@ -9,6 +9,7 @@ import torch
 from scipy.signal import lfilter
 
 import pyro_dynogp as dgp
+from pyro_dynogp.data.channels import Recorded
 from pyro_dynogp.discrepancy import residuals
 from pyro_dynogp.effects.dead_time import dead_time
 from pyro_dynogp.effects.nonlinear_feedback import (
@@ -17,7 +18,7 @@ from pyro_dynogp.effects.nonlinear_feedback import (
 )
 from pyro_dynogp.effects.output_nonlinearity import output_nonlinearity
 from pyro_dynogp.models.system import DynamicSystem
-from pyro_dynogp.models.variants import with_feedback, with_products
+from pyro_dynogp.models.variants import with_channel, with_feedback, with_products
 from tests.discrepancy.made import SETTINGS, coloured, residuals_of, within_chance
 from tests.models.closed_loops import make_record
 from tests.models.test_known import values_at
@@ -375,6 +376,11 @@ class TestProducts:
             assert 0.0 < sd < 0.15
             assert abs(mean - (1.0 - 0.8 * u)) < 3.0 * sd
         assert EFFECT.shape(found) == ""
+        wet = dgp.Record(record.time, record.inputs[:, :1], record.outputs, input_names=("heat",),
+                         extra={"flow": record.inputs[:, 1]}, time_unit="s")  # fmt: skip
+        more = with_products(with_channel(dgp.LinearDynamicGP(1, pairs=1), Recorded("flow")))
+        other = dgp.fit(more, wet, method="map", restarts=1, steps=2, workers=1, progress=False)
+        assert all("flow" in one or "heat" in one for one in EFFECT.parameters(other, None, wet))
         both = SimpleNamespace(model=with_feedback(model), scaling=fit.scaling)
         assert EFFECT.parameters(both, None, record) == {}
 
