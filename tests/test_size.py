@@ -32,10 +32,10 @@ LINES = 31_500
 # variants that are followed, and pairs of what was kept (90 lines), and errors that functions would
 # learn from and gains over refits (130 lines) came since, and effects that are taken out again
 # (170 lines), paths of gain (110 lines), climbs that go on and losses that are settled (40 lines),
-# two files of their own for evidence and for noise of starts (10 lines), products in feedback (390
-# lines, of which tests are 250), and ties that training data decide (110 lines).
+# two files of their own for evidence and for noise of starts (10 lines), products in feedback (460
+# lines, of which tests are 290), and ties that training data decide (110 lines).
 # To shrink.
-LINES_TODAY = 53_330
+LINES_TODAY = 53_400
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

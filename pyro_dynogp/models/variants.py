@@ -9,7 +9,7 @@ from pyro_dynogp.data.channels import Channel, count_direct
 from pyro_dynogp.layers.kernels import SMOOTH
 from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.product import Product, is_product
+from pyro_dynogp.models.product import Product, factors, is_product
 from pyro_dynogp.models.step import Step, is_step, usual_substeps
 from pyro_dynogp.models.wiring import (
     HIDDEN,
@@ -36,6 +36,7 @@ def with_channel(model: Model, channel: Channel) -> Model:
     more = 0 if channel.replaces else len(channel.names)
     return replace(
         model,
+        layers=_layers_of(model, more - count_direct([channel])),
         inputs=model.inputs + more,
         direct=model.direct + count_direct([channel]),
         channels=(*model.channels, channel),
@@ -47,10 +48,24 @@ def without_channel(model: Model, channel: Channel) -> Model:
     less = 0 if channel.replaces else len(channel.names)
     return replace(
         model,
+        layers=_layers_of(model, count_direct([channel]) - less),
         inputs=model.inputs - less,
         direct=model.direct - count_direct([channel]),
         channels=tuple(other for other in model.channels if other != channel),
     )
+
+
+def _layers_of(model: Model, more: int) -> tuple[Layer, ...]:
+    """The layers with so many driving inputs more: products are of all of them."""
+
+    def wider(layer: Layer) -> Layer:
+        first = factors(layer)
+        if not (first and layer.sees[:1] == (INPUTS,)):
+            return layer
+        others = layer.outputs // first
+        return Product(first + more, others, sees=layer.sees, skip=layer.skip, name=layer.name)
+
+    return tuple(wider(layer) for layer in model.layers)
 
 
 def with_channels_of(model: Model, other: Model, base: Model) -> Model | None:

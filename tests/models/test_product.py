@@ -1,6 +1,7 @@
 """Products in feedback: bilinear systems, against a dense Kalman filter, saved and copied."""
 
 import copy
+import dataclasses
 import pickle
 
 import numpy as np
@@ -8,10 +9,17 @@ import pytest
 import torch
 
 import pyro_dynogp as dgp
+from pyro_dynogp.data.channels import DeadZone, Recorded, Trend
 from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.starts.extended import extended_starts
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.product import Products, factors, is_product
-from pyro_dynogp.models.variants import with_feedback, with_products
+from pyro_dynogp.models.variants import (
+    with_channel,
+    with_feedback,
+    with_products,
+    without_channel,
+)
 from tests.models.closed_loops import ClosedLoop, check_gradient, make_record, system_at
 from tests.models.test_known import values_at as any_values_at
 
@@ -243,3 +251,50 @@ def test_without_functions_to_learn_draws_are_of_all_parameters(n, method):
     assert fit.method == method
     assert float(fit.draws["g_input_gain"].std(0).min()) > 1e-4
     assert fit.noise_sd == pytest.approx(0.01, rel=0.2)
+
+
+class TestChannels:
+    @pytest.mark.parametrize(
+        ("channel", "inputs"),
+        [(Recorded("w"), 3), (DeadZone("u1", -0.5, 0.5), 2), (Trend(0.0, 4.0), 2)],
+    )
+    def test_all_inputs_that_drive_are_multiplied(self, channel, inputs):
+        """A dead zone replaces its input, and a trend does not drive."""
+        model = with_products(with_feedback(dgp.LinearDynamicGP(2)))
+        more = with_channel(model, channel)
+        (product,) = (layer for layer in more.layers if is_product(layer))
+        assert factors(product) == inputs
+        assert more.dynamic[0][0].fed == 1 + inputs
+        assert without_channel(more, channel) == model
+
+    @pytest.mark.parametrize("integrators", [0, 1])
+    def test_what_is_learnt_stays_where_an_input_is_added(self, integrators):
+        """Gains of what comes back follow those of the inputs, and move on by one."""
+        rng = np.random.default_rng(5)
+        record = make_record(2, missing=False)
+        record = dgp.Record(record.time, record.inputs, record.outputs,
+                            extra={"w": rng.standard_normal(len(record))})  # fmt: skip
+        linear = dgp.LinearDynamicGP(2, pairs=1, process_noise=False, integrators=integrators)
+        model = with_products(with_feedback(linear))
+        fit = dgp.fit(model, record, method="map", restarts=1, steps=20, workers=1, progress=False)
+        larger = with_channel(model, Recorded("w"))
+        records = larger.prepare(record)
+        scaled = dataclasses.replace(larger, scaling=records[0].scaling)
+        start = extended_starts(fit, scaled, records, 0)[0][-1]
+        old, new = fit.mode["g_input_gain"], start["g_input_gain"]
+        assert new.shape[1] == 3 + 1 + 3
+        np.testing.assert_array_equal(new[:, [0, 1, 3, 4, 5]], old)
+        assert (new[:, [2, 6]] == 0.0).all()
+        if integrators:
+            old, new = fit.mode["g_integrator_gain"], start["g_integrator_gain"]
+            np.testing.assert_array_equal(new[:, [0, 1, 3, 4, 5]], old)
+            assert (new[:, [2, 6]] == 0.0).all()
+        before, after = (
+            output_process(system_at(given, values), prepared)
+            .one_step(prepared.observations)
+            .mean.numpy()
+            for given, values, prepared in (
+                (fit.model, fit.mode, fit.model.prepare(record)[0]), (scaled, start, records[0])
+            )
+        )  # fmt: skip
+        np.testing.assert_allclose(after, before, rtol=1e-6, atol=1e-6)

@@ -11,6 +11,7 @@ import torch
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.starts.delays import with_delays
 from pyro_dynogp.inference.starts.dynamic import Values
+from pyro_dynogp.inference.starts.gains import moved_gains
 from pyro_dynogp.inference.starts.linear import leading_layers, linear_twin, one_output
 from pyro_dynogp.inference.starts.plans import Plan, starting_point
 from pyro_dynogp.inference.starts.poles import grown, random_poles, values_given_poles
@@ -42,6 +43,7 @@ def extended_starts(
     scaling = records[0].scaling
     places = _places(base.model, model)
     learnt = {_renamed(site, places): value for site, value in base.mode.items()}
+    learnt = moved_gains(learnt, base.model, model, places)
     sites = model.all_sites(scaling, len(records))
     dynamic = base.system_at(base.mode).dynamic
     both = zip(dynamic, base.model.dynamic, strict=True)  # poles of integrators follow the pairs
