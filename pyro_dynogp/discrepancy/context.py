@@ -68,6 +68,22 @@ class Tested:
     notes: Sequence[str]
 
 
+@dataclass(frozen=True)
+class Left:
+    """What tests say of whether anything is left.
+
+    Attributes:
+        said: in words, of what is; empty where nothing is.
+        p_values: of the omnibus test of each output, paid for by their number; NaN where it cannot
+            be tested, none where single effects have answered.
+        untested: in words, why an output was not tested for anything else.
+    """
+
+    said: tuple[str, ...] = ()
+    p_values: tuple[float, ...] = ()
+    untested: tuple[str, ...] = ()
+
+
 @dataclass(eq=False)
 class SearchContext:
     """One after the other on the same data, with the same options.
@@ -208,14 +224,20 @@ class SearchContext:
     def beyond(self, residuals: Sequence[Residuals]) -> list[Beyond]:
         """What no effect of the catalogue does in each output, nothing where that is not certain.
 
-        Gains are zero there, and so is what is fitted.
+        Gains are zero there, and so is what is fitted; also where too few samples are measured.
         """
-        tests = [beyond_catalogue(one, self.settings, self.seed) for one in residuals]
+        tests = [self._beyond(one) for one in residuals]
         return [
             one if one.p_value * len(tests) <= self.gate
             else Beyond(one.p_value, 0.0, np.zeros_like(one.fitted))
             for one in tests
         ]  # fmt: skip
+
+    def _beyond(self, residuals: Residuals) -> Beyond:
+        try:
+            return beyond_catalogue(residuals, self.settings, self.seed)
+        except ValueError:  # too few samples are measured
+            return Beyond(1.0, 0.0, np.zeros(len(residuals)))
 
     def doubtful(
         self, winner: Found, residuals: Sequence[Residuals], beyond: Sequence[Beyond]
@@ -253,23 +275,27 @@ class SearchContext:
         self.held_out = shared(self.held_out, self.settings.stretches)
         return True
 
-    def left(self, looked: Tested) -> tuple[tuple[str, ...], Sequence[float]]:
-        """What is left, in words: empty where nothing is.
-
-        By the tests of single effects, all paid for, or else by the omnibus test, whose p-value for
-        each output, paid for by their number, comes second.
-        """
+    def left(self, looked: Tested) -> Left:
+        """What is left: by tests of single effects, all paid for, or else by the omnibus test."""
         named: dict[str, float] = {}
         for one in looked.found:  # an effect has several pieces of evidence, the best one first
             if one.q_value <= self.gate:
                 named.setdefault(one.effect.name, one.q_value)
         if named:
             rates = ", ".join(f"{name} ({q:.2g})" for name, q in named.items())
-            return (f"Residual tests are evidence for (false discovery rate): {rates}.",), ()
-        omnibus = [
-            structure_left(one, self.settings, self.level, plain=other, seed=self.seed)
-            for one, other in zip(looked.residuals, looked.whole, strict=True)
-        ]
-        paid = [min(1.0, p * len(omnibus)) for p, _ in omnibus]
-        said = (words for p, (_, words) in zip(paid, omnibus, strict=True) if p <= self.gate)
-        return tuple(said), paid
+            return Left((f"Residual tests are evidence for (false discovery rate): {rates}.",))
+        p_values, said, untested = [], [], []
+        for own, other in zip(looked.residuals, looked.whole, strict=True):
+            p, words = np.nan, ""
+            try:
+                p, words = structure_left(
+                    own, self.settings, self.level, plain=other, seed=self.seed
+                )
+            except ValueError as error:  # where no fit has seen them too few samples are measured
+                untested.append(
+                    f"Whether anything else is left in {own.output_name!r} was not tested: {error}"
+                )
+            p_values.append(float(np.minimum(p * len(looked.residuals), 1.0)))
+            if p_values[-1] <= self.gate:
+                said.append(words)
+        return Left(tuple(said), tuple(p_values), tuple(untested))

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from math import isnan
 from typing import TYPE_CHECKING
 
-from pyro_dynogp.discrepancy.context import SearchContext, Stopwatch, Tested
+from pyro_dynogp.discrepancy.context import Left, SearchContext, Stopwatch, Tested
 from pyro_dynogp.discrepancy.data_faults import spikes_of
 from pyro_dynogp.discrepancy.decision import LATE, Confirmed
 from pyro_dynogp.discrepancy.elimination import Added, is_superfluous, withdrawn, without
@@ -46,7 +47,7 @@ class SearchState:
         eliminated: names of effects that later ones have made superfluous.
         attempts: what was tried. tests: all tests, whatever came of them.
         reported: what no block mends, by the last tests.
-        left: what is left, in words, by the last tests. notes: what else there is to say.
+        rest: what is left by the last tests. notes: what else there is to say.
         early: whether the time limit was passed before the search came to its end.
         left_without: what is left without process noise, where rounds began again with it.
     """
@@ -66,12 +67,11 @@ class SearchState:
     attempts: list[Attempt] = field(default_factory=list)
     tests: list[EffectTest] = field(default_factory=list)
     reported: list[Found] = field(default_factory=list)
-    left: tuple[str, ...] = ()
+    rest: Left = field(default_factory=Left)
     notes: list[str] = field(default_factory=list)
     early: bool = False
     left_without: tuple[str, ...] = ()
     _looked: Tested | None = None
-    _omnibus: Sequence[float] = ()
 
     def __post_init__(self) -> None:
         self.plain = self.rounds.plain(self.first)
@@ -101,9 +101,9 @@ class SearchState:
         if confirmed is not None and confirmed.winner is not None:
             self._add(confirmed.winner, confirmed, looked)
             return True
-        if not (self.left and self.quiet) or self.added or self.early:
+        if not (self.rest.said and self.quiet) or self.added or self.early:
             return False
-        self.left_without = self.left
+        self.left_without = self.rest.said
         self._go_on_from(self.first)
         self.quiet, self.returned = False, True
         return True
@@ -152,14 +152,14 @@ class SearchState:
         self.reported = [
             f for f in looked.found if not f.effect.added and f.q_value <= self.rounds.gate
         ]
-        self.left, self._omnibus = self.rounds.left(looked)
+        self.rest = self.rounds.left(looked)
         self._looked = looked
         self.watch.stop("residual tests")
         return looked
 
     def doubt(self) -> None:
         """Add a cause outside the catalogue as a tie, where what is left explains far more."""
-        if not (self.added and self.left and self._looked):
+        if not (self.added and self.rest.said and self._looked):
             return
         beyond = self.rounds.beyond(self._looked.whole)
         self.added = [
@@ -233,7 +233,7 @@ class SearchState:
     def _chosen(self, looked: Tested) -> list[Candidate]:
         """Effects that are worth a refit, where anything is left."""
         rounds = self.rounds
-        if not self.left:
+        if not self.rest.said:
             return []
         open_loop = [f for f in looked.found if not (self._is_fed_back(f) or self._is_set_point(f))]
         return candidates_of(
@@ -246,7 +246,7 @@ class SearchState:
         decided: dict[int, Outcome] = {id(one.evidence): one.decision for one in attempts}
         for f in found:
             one, level = f.evidence, self.rounds.level
-            passed = bool(self.left) and one.p_value <= level
+            passed = bool(self.rest.said) and one.p_value <= level
             otherwise: Outcome = "not tried" if passed else "not significant"
             decision: Outcome = decided.get(id(one), otherwise)
             test = EffectTest(
@@ -259,7 +259,7 @@ class SearchState:
                 self.number, ANY, name, "", p, p,
                 "reported" if p <= self.rounds.gate else "not significant",
             )
-            for name, p in zip(names, self._omnibus, strict=False)
+            for name, p in zip(names, self.rest.p_values, strict=False) if not isnan(p)
         ]  # fmt: skip
 
     def _untried(
@@ -327,4 +327,4 @@ class SearchState:
 
     def _go_on_from(self, fit: Fit) -> None:
         self.current, self.model = fit, replace(fit.model, scaling=None)
-        self.left, self._looked, self._omnibus = (), None, ()  # they were of another model
+        self.rest, self._looked = Left(), None  # they were of another model

@@ -65,7 +65,7 @@ def report_of(fits: Sequence[Fit], course: SearchState, warnings: Sequence[str])
     base, extended, change = fits[0], fits[last], compared(last, 0)
     said = change.disagreement
     without_noise = course.dropped and kept > 0
-    left = course.left_without if without_noise else course.left
+    left = course.left_without if without_noise else course.rest.said
     if course.dropped:
         said = [compared(1, 0).of_noise(without_noise), *said]
     elif kept < count:

@@ -122,7 +122,12 @@ def close_loop(
     course.go_rounds(max_rounds)
     channels = ("", *data.known.output_names, *names)
     warnings = [fault.sentence for fault in data.faults if fault.channel in channels]
-    warnings += [*course.notes, *course.said_of_hiding(), *course.said_of_time()]
+    warnings += [
+        *course.notes,
+        *course.rest.untested,
+        *course.said_of_hiding(),
+        *course.said_of_time(),
+    ]
     # The same samples for all, so that they can be compared.
     known = where_inputs_are_known(data.known, longest_delay(course.model))
     fitted = _final([first, *course.fits], fit, known, workers, progress)

@@ -73,7 +73,8 @@ def fitted_filter(x: np.ndarray, settings: LoopSettings) -> Whitener:
 
     Products are averaged over the pairs that are there; the recursion ends where they are no
     autocovariance any more, so that the filter is stable. Its order leaves at least half of the
-    samples with all of their past where samples are missing here and there.
+    samples with all of their past where samples are missing here and there, and no fewer than a
+    test needs.
 
     Args:
         x: (n,), NaN where missing.
@@ -89,7 +90,8 @@ def fitted_filter(x: np.ndarray, settings: LoopSettings) -> Whitener:
     edges = np.flatnonzero(np.diff(np.concatenate([[0], measured.astype(int), [0]])))
     runs = edges[1::2] - edges[::2]
     whole = np.maximum(runs - np.arange(settings.filter_order + 1)[:, None], 0).sum(1)
-    highest = min(settings.filter_order, count // 10, int(np.flatnonzero(whole >= count // 2)[-1]))
+    fewest = max(count // 2, settings.measured_samples)
+    highest = min(settings.filter_order, count // 10, int(np.flatnonzero(whole >= fewest)[-1]))
     filled = np.where(measured, x - x[measured].mean(), 0.0)
     length = next_fast_len(len(x) + highest + 1, real=True)
     power = np.abs(rfft(filled, length)) ** 2

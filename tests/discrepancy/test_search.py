@@ -12,7 +12,7 @@ from scipy import stats
 import pyro_dynogp as dgp
 from pyro_dynogp import effects
 from pyro_dynogp.data.channels import DeadZone
-from pyro_dynogp.discrepancy.context import SearchContext
+from pyro_dynogp.discrepancy.context import Left, SearchContext
 from pyro_dynogp.discrepancy.held_out import certain, without
 from pyro_dynogp.discrepancy.search import Found, candidates_of, extended_by, look, rated
 from pyro_dynogp.discrepancy.state import SET_POINT, SearchState
@@ -165,10 +165,10 @@ def test_a_set_point_is_not_tried_and_other_effects_are(state):
         False,
     ]
     assert not any(state._is_fed_back(one) for one in (own, other))
-    state.left = ("something",)
+    state.rest = Left(("something",))
     attempts = {one.channel: one.reason for one in state._untried([own, other], [], "others")}
     assert attempts == {"r": SET_POINT, "w": "others"}
-    state.reported, state.left = [], ()
+    state.reported, state.rest = [], Left()
     assert not state._is_set_point(own)
 
 
@@ -179,9 +179,9 @@ def test_two_answers_to_whether_anything_is_left_share_the_level(state):
     assert half.gate == pytest.approx(0.01)
     found = Found(*speaking(effects.LevelShift(), 0.02), 0.03)
     looked = SimpleNamespace(found=[found], residuals=[], whole=[])
-    assert context.left(looked)[0] == ()  # 0.03 is more than half of 0.05
+    assert context.left(looked).said == ()  # 0.03 is more than half of 0.05
     sure = SimpleNamespace(found=[replace(found, q_value=0.02)], residuals=[], whole=[])
-    assert "level shift (0.02)" in context.left(sure)[0][0]
+    assert "level shift (0.02)" in context.left(sure).said[0]
 
 
 def test_the_omnibus_test_pays_for_its_five_ways(monkeypatch):

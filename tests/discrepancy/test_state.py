@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -76,18 +77,64 @@ def test_what_is_left_is_said(rounds):
         Found(effects.LevelShift(), Evidence("level shift", 1.0, q / 4, 3.0, 0.1), q)
         for q in (0.03, 0.02)
     ]
-    said, (p,) = rounds.left(Tested([quiet], [quiet], [], []))
-    assert said == ()
-    assert p > rounds.gate
-    said, _ = rounds.left(Tested([quiet], [quiet], found[:1], []))
-    assert said == ()  # half of the level is 0.025
-    assert "level shift (0.02)" in rounds.left(Tested([quiet], [quiet], found, []))[0][0]
+    nothing = rounds.left(Tested([quiet], [quiet], [], []))
+    assert nothing.said == nothing.untested == ()
+    assert nothing.p_values[0] > rounds.gate
+    # Half of the level is 0.025.
+    assert rounds.left(Tested([quiet], [quiet], found[:1], [])).said == ()
+    both = rounds.left(Tested([quiet], [quiet], found, []))
+    assert "level shift (0.02)" in both.said[0]
+    assert both.p_values == ()
     better = Found(effects.LevelShift(), Evidence("level shift", 1.0, 1e-3, 3.0, 0.1), 4e-3)
-    (said,), _ = rounds.left(Tested([quiet], [quiet], [better, *found], []))
+    (said,) = rounds.left(Tested([quiet], [quiet], [better, *found], [])).said
     assert "level shift (0.004)" in said
-    (said,), (p,) = rounds.left(Tested([quiet], [product], [], []))
-    assert p <= rounds.gate
-    assert "products of inputs" in said
+    other = rounds.left(Tested([quiet], [product], [], []))
+    assert other.p_values[0] <= rounds.gate
+    assert "products of inputs" in other.said[0]
+
+
+def test_what_cannot_be_tested_is_said_and_ends_nothing(rounds):
+    """One of two outputs has too few samples where no fit has seen it: the other one is tested."""
+    product = residuals(3, 400, effect=lambda t, mean, u: share(u[:, 0] * np.roll(u[:, 0], 6), 0.3))
+    few = replace(
+        product, output_name="few", held_out=np.arange(400) < SETTINGS.measured_samples - 1
+    )
+    left = rounds.left(Tested([few, product], [product, product], [], []))
+    assert np.isnan(left.p_values[0])
+    assert left.p_values[1] <= rounds.gate
+    assert len(left.said) == len(left.untested) == 1
+    assert "'few' was not tested" in left.untested[0]
+    assert "expected at least 30" in left.untested[0]
+    nothing, certain = rounds.beyond([few, product])
+    assert (nothing.p_value, nothing.gain) == (1.0, 0.0)
+    assert not nothing.fitted.any()
+    assert certain.gain > 0.0
+    state = SimpleNamespace(
+        rounds=SimpleNamespace(
+            level=0.05, gate=rounds.gate,
+            data=SimpleNamespace(known=SimpleNamespace(output_names=("few", "y"))),
+        ),
+        rest=left, attempts=[], tests=[], number=1,
+    )  # fmt: skip
+    SearchState._list(state, [], [])
+    assert [test.output for test in state.tests] == ["y"]  # no p-value where there was no test
+
+
+def test_a_short_record_with_a_step_is_searched_to_its_end():
+    """Half of the block that is searched goes to the fit: 30 samples in three stretches are left.
+
+    A filter of a higher order than such stretches allow ended the loop with an error.
+    """
+    rng, n = np.random.default_rng(4), 240
+    u = np.repeat(rng.standard_normal(n // 4), 4)
+    y = lfilter([0.0, 0.2], [1.0, -0.8], u)
+    y = y / y.std() + 0.05 * rng.standard_normal(n)
+    y[135:] += 0.5
+    record = dgp.Record(np.arange(float(n)), u, y)
+    fit = dgp.fit(MODEL, record[:120], restarts=1, workers=1, progress=False, method="map")
+    report = dgp.close_loop(fit, record, effects=(effects.LevelShift(),), workers=1, progress=False)
+    assert [effect.name for effect in report.effects] == ["level shift"]
+    assert report.outcome == "effects added"
 
 
 def level_shift(gain: float) -> Found:

@@ -82,6 +82,10 @@ def test_filters_have_an_order_at_most_and_samples_at_least():
     noisy = period + 0.1 * np.random.default_rng(0).standard_normal(400)
     assert fitted_filter(noisy, FEW).order > 2
     assert fitted_filter(noisy, other(filter_order=2)).order == 2
+    # Each order costs three stretches of twelve samples one each: 30 are left of order two.
+    gaps = np.where(np.arange(400) % 24 < 12, noisy, np.nan)[:72]
+    assert fitted_filter(gaps, other(measured_samples=20)).order == 3
+    assert fitted_filter(gaps, other(measured_samples=30)).order == 2
     r = residuals(0, 60)
     assert np.isfinite(held_out_innovations(r, other(measured_samples=60))).sum() == 60
     with pytest.raises(ValueError, match="at least 61 held-out innovations"):
