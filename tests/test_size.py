@@ -33,9 +33,10 @@ LINES = 31_500
 # learn from and gains over refits (130 lines) came since, and effects that are taken out again
 # (170 lines), paths of gain (110 lines), climbs that go on and losses that are settled (40 lines),
 # two files of their own for evidence and for noise of starts (10 lines), products in feedback (460
-# lines, of which tests are 290), and ties that training data decide (110 lines).
+# lines, of which tests are 290), ties that training data decide (110 lines), and outputs that
+# cannot be tested and half-known gains of linear models (120 lines, of which tests are 90).
 # To shrink.
-LINES_TODAY = 53_400
+LINES_TODAY = 53_440
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 def one_step_errors(fit: Fit, record: Record, held_out: np.ndarray) -> np.ndarray:
     """Standardised one-step errors (n, n_y), NaN where the output is missing.
 
-    Functions are half-known where training data hardly went, and what is wrong there looks like
-    noise that is coloured, or of changing size. Of models with functions errors held out are those
-    that are left once parameters have learnt from them, along directions of which they say more
-    than what was fitted. To first order these are
+    Functions are half-known where training data hardly went, gains and poles after a short record,
+    and what is wrong there looks like noise that is coloured, or of changing size. Errors held out
+    are those that are left once parameters have learnt from them, along directions of which they
+    say more than what was fitted. To first order these are
 
         e - sum_{s > 1} s^2 / (1 + s^2) v v^T e,    R^T J = U diag(s) V^T,    R R^T = (F + P)^-1,
 
@@ -38,8 +38,7 @@ def one_step_errors(fit: Fit, record: Record, held_out: np.ndarray) -> np.ndarra
     errors = fit.innovations(record)
     model = fit.model.collapsed
     normal = has_innovations(model) and model.likelihood.gaussian
-    learns = model.has_function and normal and isinstance(fit.posterior, Mixture)
-    if not learns or held_out.all():
+    if not normal or not isinstance(fit.posterior, Mixture) or held_out.all():
         return errors
     (along,) = model.prepare(where_inputs_are_known(record, longest_delay(model)))
     potential = Potential(model, ((along,),), fit.mode)

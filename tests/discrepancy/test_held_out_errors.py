@@ -1,4 +1,4 @@
-"""One-step errors where a function was half-known: what the noise is tested by."""
+"""One-step errors where a model was half-known: what the noise is tested by."""
 
 from __future__ import annotations
 
@@ -71,15 +71,51 @@ def test_what_a_function_did_not_know_is_no_noise(plain, monkeypatch: pytest.Mon
     assert min(p_values(record, fit).values()) < 1e-6
 
 
+def stirred(disturbance: float = 0.0) -> dgp.Record:
+    """A linear plant with a second input that hardly moves before the data held out."""
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.standard_normal((N // 10, 2)), 10, axis=0)
+    u[~HELD_OUT, 1] *= 0.01
+    y = lfilter([0.0, 0.2], [1.0, -0.8], u[:, 0] + u[:, 1])
+    sd = 0.05 * y.std()
+    slow = lfilter([1.0], [1.0, -0.8], rng.standard_normal(N))
+    y = y + sd * (rng.standard_normal(N) + disturbance * slow)
+    return dgp.Record(0.5 * np.arange(N), u, y[:, None])
+
+
+@pytest.mark.parametrize("process_noise", [False, True])
+def test_gains_that_were_half_known_are_no_noise(
+    monkeypatch: pytest.MonkeyPatch, process_noise: bool
+) -> None:
+    """Of a linear model too; a fit to all data is the oracle."""
+    record = stirred()
+    model = dgp.LinearDynamicGP(2, pairs=1, process_noise=process_noise)
+    fit = dgp.fit(model, record[:FITTED], method="map", workers=1, progress=False)
+    known = refit(fit, record).innovations(record)[HELD_OUT, 0]
+    before = fit.innovations(record)[HELD_OUT, 0]
+    errors = one_step_errors(fit, record, HELD_OUT)[HELD_OUT, 0]
+    assert before.std() > 3.0
+    assert np.corrcoef(before, known)[0, 1] < 0.5
+    assert 0.8 < errors.std() < 1.2
+    assert np.corrcoef(errors, known)[0, 1] > 0.95
+    assert min(p_values(record, fit).values()) > 0.01
+    monkeypatch.setattr(held_out_errors, "has_innovations", lambda model: False)
+    assert min(p_values(record, fit).values()) < 1e-6
+
+
 def test_noise_that_is_there_is_found() -> None:
     record = valve(disturbance=0.8)
     assert p_values(record, fitted(record))["process noise"] < 1e-4
+    record = stirred(disturbance=0.8)
+    model = dgp.LinearDynamicGP(2, pairs=1, process_noise=False)
+    fit = dgp.fit(model, record[:FITTED], method="map", workers=1, progress=False)
+    assert p_values(record, fit)["process noise"] < 1e-4
 
 
 @pytest.mark.parametrize(
     "model",
     [
-        dgp.LinearDynamicGP(1, pairs=1),
+        dgp.LinearDynamicGP(1, pairs=1, likelihood=dgp.StudentT()),
         dgp.Hammerstein(1, pairs=1, process_noise=False, likelihood=dgp.StudentT()),
     ],
 )
