@@ -124,7 +124,7 @@ def test_a_function_of_the_output_has_its_limits_too(state, monkeypatch):
         return SimpleNamespace(found=[], residuals=[], whole=[], notes=[])
 
     monkeypatch.setattr(SearchContext, "look", look_)
-    monkeypatch.setattr(SearchContext, "left", lambda self, looked: ((), ()))
+    monkeypatch.setattr(SearchContext, "left", lambda self, looked: Left())
     general = Found(*speaking(effects.OutputNonlinearity(), 1e-9), 1e-8)
     state.added = [added(general)]
     state.look()

@@ -9,7 +9,7 @@ import pytest
 
 import pyro_dynogp as dgp
 from pyro_dynogp import LoopSettings, effects
-from pyro_dynogp.discrepancy.context import SearchContext
+from pyro_dynogp.discrepancy.context import Left, SearchContext
 from pyro_dynogp.discrepancy.result import KEPT
 from pyro_dynogp.models.variants import has_process_noise
 from pyro_dynogp.report import last_block
@@ -278,8 +278,9 @@ def test_what_is_left_is_said_of_the_model_that_the_report_gives(
         looked_at.append(fit)
         return look(self, fit, *args)
 
-    def left(self: SearchContext, looked: Any) -> Any:
-        return ((), (1.0,)) if has_process_noise(looked_at[-1].model) else (("something",), ())
+    def left(self: SearchContext, looked: Any) -> Left:
+        noisy = has_process_noise(looked_at[-1].model)
+        return Left(p_values=(1.0,)) if noisy else Left(("something",))
 
     monkeypatch.setattr(SearchContext, "look", looking)
     monkeypatch.setattr(SearchContext, "left", left)
