@@ -33,10 +33,11 @@ LINES = 31_500
 # learn from and gains over refits (130 lines) came since, and effects that are taken out again
 # (170 lines), paths of gain (110 lines), climbs that go on and losses that are settled (40 lines),
 # two files of their own for evidence and for noise of starts (10 lines), products in feedback (460
-# lines, of which tests are 290), ties that training data decide (110 lines), and outputs that
-# cannot be tested and half-known gains of linear models (120 lines, of which tests are 90).
+# lines, of which tests are 290), ties that training data decide (110 lines), outputs that cannot
+# be tested and half-known gains of linear models (120 lines, of which tests are 90), and evidence
+# of all known data (80 lines).
 # To shrink.
-LINES_TODAY = 53_440
+LINES_TODAY = 53_520
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

@@ -111,6 +111,11 @@ class SearchContext:
         self.held_out = self.data.held_out
 
     @property
+    def looked_at(self) -> np.ndarray:
+        """Samples (n,) whose residuals are tested: those held out, or all where none is."""
+        return self.held_out if self.held_out.any() else np.ones_like(self.held_out)
+
+    @property
     def gate(self) -> float:
         """Level of each of the two answers to whether anything is left: that of both, halved."""
         return self.level * self.settings.gate
@@ -146,11 +151,11 @@ class SearchContext:
             fit: of the model so far. known: names of effects that it has.
             plain: fit without process noise, where there is one already.
         """
-        residuals = self.residuals(fit, self.data.known, self.held_out)
+        residuals = self.residuals(fit, self.data.known, self.looked_at)
         plain = self.plain(fit) if plain is None else plain
         left = residuals
         if plain is not fit:
-            left = self.residuals(plain, self.data.known, self.held_out)
+            left = self.residuals(plain, self.data.known, self.looked_at)
         everywhere = np.ones(len(self.data.known), dtype=bool)
         whole = [replace(one, held_out=everywhere) for one in left]
         effects = [e for e in self.effects if not (e.once and e.name in known)]
@@ -299,3 +304,17 @@ class SearchContext:
             if p_values[-1] <= self.gate:
                 said.append(words)
         return Left(tuple(said), tuple(p_values), tuple(untested))
+
+    def explained(self, fit: Fit, known: Collection[str]) -> bool:
+        """Whether a model leaves nothing once it is fitted to all known data, block B as well.
+
+        What poles and gains do that were badly known before B looks like structure there. Tests on
+        what was fitted err on the safe side, but what a model cannot follow is left in all data.
+
+        Args:
+            fit: of the model to what is not held out. known: names of effects that it has.
+        """
+        whole = replace(self)
+        whole.held_out = np.zeros_like(self.held_out)
+        again = whole.refit(fit, replace(fit.model, scaling=None))
+        return not whole.left(whole.look(again, known)).said

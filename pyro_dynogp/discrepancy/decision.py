@@ -14,9 +14,8 @@ from pyro_dynogp.discrepancy.judged import Judged, kind_of
 from pyro_dynogp.discrepancy.refits import Refits
 from pyro_dynogp.discrepancy.result import Attempt
 from pyro_dynogp.discrepancy.search import Candidate, Found
-from pyro_dynogp.discrepancy.trials import VERY_STRONG
 from pyro_dynogp.fitting import Fit
-from pyro_dynogp.inference.schwarz import counted, log_evidence_of
+from pyro_dynogp.inference.bayes_factor import VERY_STRONG, counted, log_evidence_of
 from pyro_dynogp.models.variants import Model
 from pyro_dynogp.statistics.settings import LoopSettings
 
@@ -103,7 +102,7 @@ def confirm(
         equal = [k for k, one in enumerate(playing) if one is best or _ties(one, best, settings)]
         equal = _needed(equal, playing)
         winner = better[_chosen(better, playing, equal, level)]
-        fair = refits.against_refit(winner)
+        fair = refits.supported(refits.against_refit(winner))
         judged = [fair if one is winner else one for one in judged]
         if fair.helps:
             better, winner = [fair if one is winner else one for one in better], fair

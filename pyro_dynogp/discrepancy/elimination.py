@@ -13,7 +13,7 @@ from pyro_dynogp.discrepancy.held_out import certain, held_out_density
 from pyro_dynogp.discrepancy.result import Attempt, EffectTest
 from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.fitting import Fit
-from pyro_dynogp.inference.schwarz import log_bayes_factor
+from pyro_dynogp.inference.bayes_factor import log_bayes_factor
 from pyro_dynogp.models.variants import Model, without_channels_of
 from pyro_dynogp.statistics.evidence import Residuals
 from pyro_dynogp.statistics.settings import LoopSettings

@@ -17,6 +17,10 @@ from pyro_dynogp.discrepancy.judged import SPREAD, Judged, Kind, judge, kind_of
 from pyro_dynogp.discrepancy.search import Candidate, Found
 from pyro_dynogp.discrepancy.trials import Trial, Tried, run, with_substeps
 from pyro_dynogp.fitting import Fit
+from pyro_dynogp.inference.bayes_factor import VERY_STRONG, log_evidence_of
+from pyro_dynogp.inference.refit import refit
+from pyro_dynogp.inference.run import Run
+from pyro_dynogp.models.delays import comparable
 from pyro_dynogp.models.variants import Model
 from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.support.parallel import parallel_map
@@ -130,6 +134,28 @@ class Refits:
             f"{one.attempt.reason}; over the model without it, refitted, {again.attempt.reason}"
         )
         return replace(again, attempt=replace(again.attempt, reason=reason))
+
+    def supported(self, one: Judged) -> Judged:
+        """A candidate that helps, if all known data speak for it, once models are fitted to them.
+
+        Where poles, gains or levels were badly known before block B, what is wrong there may look
+        like a step or a drift, and the model with that forecasts better. What parameters learn from
+        B is no effect. Evidence is Laplace's. (Effects of inputs are looked for in all data, and
+        need none.)
+        """
+        if one.found.effect.acts_on == "inputs" or one.tried.fit is None or not one.helps:
+            return one
+        same = comparable(self.record, [self.model, one.tried.model], self.settings.reach)
+        run = Run(self.seed, workers=1)
+        without, extended = (
+            log_evidence_of(refit(fit, same, model=model, run=run))
+            for fit, model in ((self.current, self.model), (one.tried.fit, one.tried.model))
+        )
+        if extended - without > VERY_STRONG:
+            return one
+        said = f"fitted to all known data, the evidence for it is {extended - without:+.1f} nats"
+        attempt = replace(one.attempt, reason=f"{one.attempt.reason}; {said}")
+        return replace(one, attempt=attempt, helps=False)
 
     def with_substeps(self, one: Judged) -> Tried:
         """What was kept of a candidate, with substeps where they are better and time is left."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from pyro_dynogp.discrepancy.context import Left, SearchContext, Stopwatch, Tested
 from pyro_dynogp.discrepancy.data_faults import spikes_of
-from pyro_dynogp.discrepancy.decision import LATE, Confirmed
+from pyro_dynogp.discrepancy.decision import Confirmed
 from pyro_dynogp.discrepancy.elimination import Added, is_superfluous, withdrawn, without
 from pyro_dynogp.discrepancy.result import Attempt, EffectTest, Outcome
 from pyro_dynogp.discrepancy.search import Candidate, Found, candidates_of, extended_by
@@ -25,6 +25,10 @@ OTHERS = "others are more probable, or no block of the model stands for it"
 ANY = "any structure"
 SET_POINT = "it is the set point of a controller, and acts through the input alone"
 OVER = "the most effects that may be added are added"
+EXPLAINED = (
+    "The model leaves nothing of it once it is fitted to the block that was searched as well: "
+    "before, its parameters were not known well enough there. report.fit is fitted to both blocks."
+)
 
 
 @dataclass(eq=False)
@@ -50,6 +54,7 @@ class SearchState:
         rest: what is left by the last tests. notes: what else there is to say.
         early: whether the time limit was passed before the search came to its end.
         left_without: what is left without process noise, where rounds began again with it.
+        looked: what the last tests saw; None where the model has changed since.
     """
 
     rounds: SearchContext
@@ -71,7 +76,7 @@ class SearchState:
     notes: list[str] = field(default_factory=list)
     early: bool = False
     left_without: tuple[str, ...] = ()
-    _looked: Tested | None = None
+    looked: Tested | None = None
 
     def __post_init__(self) -> None:
         self.plain = self.rounds.plain(self.first)
@@ -117,6 +122,7 @@ class SearchState:
                     self._list(found := self.look().found, self._untried(found, [], OVER))
                 break
         if not self.early:
+            self.explain()
             self.doubt()
 
     @property
@@ -141,27 +147,37 @@ class SearchState:
 
     def look(self) -> Tested:
         """Test the residuals of the model so far."""
-        known = {one.effect.name for one, _ in self.accepted}
-        if self.quiet:
-            known |= {one.name for one in self.rounds.effects if one.absorbs_structure}
-        # A function of the output that is there has its limits, too.
-        known |= {one.name for one in self.rounds.effects if one.special_of in known}
         plain = None if self.added else self.plain
-        looked = self.rounds.look(self.current, known, plain)
+        looked = self.rounds.look(self.current, self._known(self.quiet), plain)
         # Of the last tests: what a model lacks may look like what no block mends (feedback).
         self.reported = [
             f for f in looked.found if not f.effect.added and f.q_value <= self.rounds.gate
         ]
         self.rest = self.rounds.left(looked)
-        self._looked = looked
+        self.looked = looked
         self.watch.stop("residual tests")
         return looked
 
+    def explain(self) -> None:
+        """Take back what is left, where the model leaves nothing once it is fitted to block B."""
+        if self.reported:  # no fit mends it
+            return
+        rounds = self.rounds
+        said: list[str] = []
+        if self.rest.said and rounds.explained(self.current, self._known(self.quiet)):
+            said += self.rest.said
+            self.rest = replace(self.rest, said=())
+        if self.left_without and rounds.explained(self.plain, self._known(quiet=True)):
+            said += self.left_without
+            self.left_without = ()
+        self.notes += [f"{one} {EXPLAINED}" for one in dict.fromkeys(said)]
+        self.watch.stop("residual tests")
+
     def doubt(self) -> None:
         """Add a cause outside the catalogue as a tie, where what is left explains far more."""
-        if not (self.added and self.rest.said and self._looked):
+        if not (self.added and self.rest.said and self.looked):
             return
-        beyond = self.rounds.beyond(self._looked.whole)
+        beyond = self.rounds.beyond(self.looked.whole)
         self.added = [
             self._doubted(one)
             if OUTSIDE not in one.confirmed.ties
@@ -171,45 +187,17 @@ class SearchState:
         ]
         self.watch.stop("residual tests")
 
-    def said_of_time(self) -> list[str]:
-        """That the search ended early, and what was not tried."""
-        if not self.early:
-            return []
-        said = f"The search ended early: the time limit of {self.watch.limit:g} s was passed"
-        if self.number == 0:
-            return [f"{said} before the first round. No residual was tested."]
-        if self._looked is None:
-            return [f"{said} after round {self.number}. What the model leaves since then was not "
-                    "tested."]  # fmt: skip
-        own = [one for one in self.attempts if one.round == self.number]
-        parts = [f"{said} in round {self.number}, which added nothing."]
-        for words, decision in (("Not refitted", "not tried"), ("Not decided", "undecided")):
-            names = dict.fromkeys(
-                one.name for one in own if one.decision == decision and one.reason.endswith(LATE)
-            )
-            if names:
-                parts.append(f"{words}: {', '.join(names)}.")
-        return [" ".join(parts)]
+    def _known(self, quiet: bool) -> set[str]:
+        """Names of effects that are not looked for: those that are added, and what goes with them.
 
-    def said_of_hiding(self) -> list[str]:
-        """That process noise hides what is missing, and what was done about it."""
-        if not self.hidden:
-            return []
-        if not has_process_noise(self.first.model):  # it is in some layers only
-            done = "Fit it with process_noise=False, and close the loop on that."
-        elif self.dropped:
-            ways = "with or without it" if self.returned else "without it"
-            done = f"Nothing was found to add {ways}."
-        elif self.returned:
-            done = "The search without it found nothing to add, and began again with it."
-        elif not self.added:
-            done = "The search began without it."
-        else:
-            back = has_process_noise(self.current.model)
-            done = "The search began without it, and the extended model " + (
-                "has it again: there it costs nothing." if back else "does without it."
-            )
-        return [f"The model as given {self.hidden}: such noise can hide what is missing. {done}"]
+        Args:
+            quiet: whether process noise is taken away.
+        """
+        known = {one.effect.name for one, _ in self.accepted}
+        if quiet:
+            known |= {one.name for one in self.rounds.effects if one.absorbs_structure}
+        # A function of the output that is there has its limits, too.
+        return known | {one.name for one in self.rounds.effects if one.special_of in known}
 
     def _is_fed_back(self, found: Found) -> bool:
         """Whether inputs under feedback make an effect: it goes with them, and is less certain.
@@ -327,4 +315,4 @@ class SearchState:
 
     def _go_on_from(self, fit: Fit) -> None:
         self.current, self.model = fit, replace(fit.model, scaling=None)
-        self.rest, self._looked = Left(), None  # they were of another model
+        self.rest, self.looked = Left(), None  # they were of another model

@@ -15,9 +15,9 @@ from pyro_dynogp.discrepancy.held_out import certain, held_out_density, scored, 
 from pyro_dynogp.discrepancy.rehearsal import lasting
 from pyro_dynogp.effects.base import Compared, Score
 from pyro_dynogp.fitting import Fit
+from pyro_dynogp.inference.bayes_factor import VERY_STRONG, energy, log_bayes_factor
 from pyro_dynogp.inference.refit import race, refit, refits
 from pyro_dynogp.inference.run import Run
-from pyro_dynogp.inference.schwarz import energy, log_bayes_factor
 from pyro_dynogp.models.delays import comparable, longest_delay
 from pyro_dynogp.models.variants import Model, with_usual_substeps
 from pyro_dynogp.statistics.settings import LoopSettings
@@ -26,8 +26,6 @@ from pyro_dynogp.statistics.settings import LoopSettings
 MOVES = 4
 # A signal that varies by no more than this share of its size is constant, as for a fit.
 CONSTANT = 1e-12
-# Log Bayes factor from which on evidence is very strong (Kass & Raftery, JASA 90:773, 1995) [nats].
-VERY_STRONG = 5.0
 # Errors of forecasts are noise alone up to so many of its standard deviations: parameters learnt
 # from a few hundred samples add some percent, and so many errors tell their size to four.
 NOISE_ALONE = 1.1

@@ -10,6 +10,7 @@ from typing import TypeVar
 import torch
 
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.inference.bayes_factor import energy
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.function_evidence import kernel_sites, kernels_by_evidence
 from pyro_dynogp.inference.methods.base import Problem
@@ -28,7 +29,6 @@ from pyro_dynogp.inference.optimise.maximum import (
 from pyro_dynogp.inference.optimise.optimum import Optimum
 from pyro_dynogp.inference.posteriors import Mixture, Sampled, draws_of_guide
 from pyro_dynogp.inference.run import Run
-from pyro_dynogp.inference.schwarz import energy
 from pyro_dynogp.inference.starts.dynamic import Values
 from pyro_dynogp.inference.starts.extended import extended_starts
 from pyro_dynogp.inference.starts.linear import linear_starts

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from pyro_dynogp.inference.bayes_factor import counted
 from pyro_dynogp.inference.fitted import Fitted
-from pyro_dynogp.inference.schwarz import counted
 from pyro_dynogp.statistics.growth import least_stable_pole
 
 # A plant is unstable where a pole multiplies its state by exp(GROWTH) within the record and lies

@@ -323,6 +323,8 @@ def test_pairs_are_tried_where_no_structure_is_certain(
         def against_refit(self, winner: Any) -> Any:
             return winner
 
+        supported = against_refit
+
         def with_substeps(self, winner: Any) -> Any:
             return winner.tried
 

@@ -15,11 +15,11 @@ from pyro_dynogp.discrepancy.held_out import forecast_errors, held_out_density
 from pyro_dynogp.discrepancy.search import candidates_of
 from pyro_dynogp.discrepancy.trials import Trial, run, why_not
 from pyro_dynogp.inference import refit as refits
+from pyro_dynogp.inference.bayes_factor import energy
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.refit import race, refit
 from pyro_dynogp.inference.run import Run
-from pyro_dynogp.inference.schwarz import energy
 from pyro_dynogp.inference.starts.extended import extended_starts
 from pyro_dynogp.models.delays import longest_delay, unknown_beginning
 from pyro_dynogp.models.variants import (

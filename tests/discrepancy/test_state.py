@@ -15,6 +15,7 @@ from pyro_dynogp.discrepancy.blocks import blocks_of
 from pyro_dynogp.discrepancy.context import SearchContext, Tested
 from pyro_dynogp.discrepancy.held_out import without
 from pyro_dynogp.discrepancy.search import Found
+from pyro_dynogp.discrepancy.search_notes import said_of_hiding
 from pyro_dynogp.discrepancy.state import SearchState
 from pyro_dynogp.inference.refit import refit
 from pyro_dynogp.models.variants import has_process_noise, without_process_noise
@@ -273,8 +274,8 @@ def test_what_was_done_about_noise_that_hides_is_said(noise, accepted, returned,
         hidden="forecasts better", first=first, current=current, added=accepted,
         returned=returned, dropped=dropped,
     )  # fmt: skip
-    (sentence,) = SearchState.said_of_hiding(course)
+    (sentence,) = said_of_hiding(course)
     assert sentence.startswith("The model as given forecasts better")
     assert said in sentence
     course.hidden = ""
-    assert SearchState.said_of_hiding(course) == []
+    assert said_of_hiding(course) == []

@@ -1,4 +1,4 @@
-"""Evidence of posterior modes: by Schwarz's criterion, and by Laplace's approximation."""
+"""How far data speak for one posterior mode against another: Schwarz's criterion, and Laplace's."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ import math
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.laplace import log_evidence
+
+# Log Bayes factor from which on evidence is very strong (Kass & Raftery, JASA 90:773, 1995) [nats].
+VERY_STRONG = 5.0
 
 
 def energy(fit: Fitted) -> float:
