@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -45,6 +46,20 @@ class Stretch:
     chance: np.ndarray
 
 
+@dataclass(frozen=True)
+class Held:
+    """What 95 % intervals hold of the samples.
+
+    Attributes:
+        share: of samples inside. p_value: probability of as few, were the forecasts right.
+        right: whether nothing is evidence against the forecasts.
+    """
+
+    share: float
+    p_value: float
+    right: bool
+
+
 def forecast_findings(fit: Fitted, *, seed: int = 0, progress: bool = False) -> list[Finding]:
     """Whether forecasts hold, from within the training record (leave-future-out).
 
@@ -86,7 +101,7 @@ def _ahead(fit: Fitted, seed: int, ends: tuple[float, float]) -> list[Stretch] |
     try:
         again = refit(fit, past, run=Run(fit.seed, workers=1))
         return [
-            _stretch(again, before, after, seed)
+            stretch_of(again, before, after, seed)
             for before, after in zip(past, future, strict=True)
             if np.isfinite(after.outputs).any(0).all()
         ]
@@ -94,7 +109,8 @@ def _ahead(fit: Fitted, seed: int, ends: tuple[float, float]) -> list[Stretch] |
         return f"not checked: the first {100 * cut:.0f} % cannot be fitted alone ({error})"
 
 
-def _stretch(fit: Fitted, past: Record, future: Record, seed: int) -> Stretch:
+def stretch_of(fit: Fitted, past: Record, future: Record, seed: int) -> Stretch:
+    """The forecast of a part from what came before it, against what was measured there."""
     predicted = forecast(fit, past, future, samples=SAMPLES, seed=seed)
     low, high = predicted.quantile(0.025), predicted.quantile(0.975)
     y = future.outputs
@@ -104,23 +120,34 @@ def _stretch(fit: Fitted, past: Record, future: Record, seed: int) -> Stretch:
     return Stretch(int(inside[0]), int(there.sum()), inside[1:])
 
 
-def _finding(stretches: list[Stretch], known: bool) -> Finding:
-    """What stretches say; `known`: whether errors of joint samples go together as they should."""
+def held_by(stretches: Sequence[Stretch], known: bool, chance: float = CHANCE) -> Held:
+    """Whether intervals hold their share of the samples.
+
+    Args:
+        stretches: forecasts of the same parameters.
+        known: whether errors of joint samples go together as they should, as of linear models.
+        chance: probability of as few from which that is no chance.
+    """
     count = sum(one.count for one in stretches)
     inside = sum(one.inside for one in stretches)
     as_few = (np.sum([one.chance for one in stretches], axis=0) <= inside).sum()
     p = float((1 + as_few) / (1 + len(stretches[0].chance)))
     share = inside / count
-    bad = share < HOLDS and (p < CHANCE or not known)
+    return Held(share, p, share >= HOLDS or (known and p >= chance))
+
+
+def _finding(stretches: list[Stretch], known: bool) -> Finding:
+    """What stretches say; `known`: see `held_by`."""
+    held = held_by(stretches, known)
     each = " and ".join(f"{100 * one.inside / one.count:.0f} %" for one in stretches)
     text = (
         f"of later parts by refits to what came before: the 95 % interval holds {each} of the "
         f"samples"
     )
-    text += f" (as few by chance: p = {p:.2g})" if known else ""
-    if bad:
+    text += f" (as few by chance: p = {held.p_value:.2g})" if known else ""
+    if not held.right:
         text += (
             ". Free runs and forecasts are not to be trusted: see what the model lacks "
             "(close_loop), or try another structure"
         )
-    return Finding(NAME, share, not bad, text, HOLDS)
+    return Finding(NAME, held.share, held.right, text, HOLDS)

@@ -21,6 +21,7 @@ from pyro_dynogp.effects.base import Effect, experiment
 from pyro_dynogp.models.description import describe, in_words
 from pyro_dynogp.prediction.records import joined
 from pyro_dynogp.prediction.scores import scores
+from pyro_dynogp.report.last_block_bands import said_of_bands
 from pyro_dynogp.report.report import Report
 from pyro_dynogp.statistics.evidence import Residuals
 from pyro_dynogp.statistics.settings import LoopSettings
@@ -49,7 +50,6 @@ def report_of(fits: Sequence[Fit], course: SearchState, warnings: Sequence[str])
     sealed = np.zeros(len(whole), dtype=bool)
     sealed[len(data.known) :] = True
     densities = [one_step_density(one, whole)[sealed] for one in fits]
-
     there = np.isfinite(densities[0])
 
     def compared(after: int, before: int) -> Compared:
@@ -66,6 +66,8 @@ def report_of(fits: Sequence[Fit], course: SearchState, warnings: Sequence[str])
     said = change.disagreement
     without_noise = course.dropped and kept > 0
     left = course.left_without if without_noise else course.rest.said
+    share = measured[kept]["coverage_95"]
+    left += said_of_bands(fits[kept], data.known, data.sealed, share, seed=rounds.seed)
     if course.dropped:
         said = [compared(1, 0).of_noise(without_noise), *said]
     elif kept < count:
