@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -68,18 +69,24 @@ def test_what_a_fit_to_all_known_data_explains_is_not_left(
     assert rounds.held_out.sum() == 150  # that of the rounds is as before
 
 
-@pytest.mark.parametrize(("reported", "explained"), [([], True), ([], False), (["feedback"], True)])
-def test_what_is_explained_is_taken_back_and_said(reported: list[str], explained: bool) -> None:
-    """But where feedback is reported, which no fit mends."""
+@pytest.mark.parametrize(
+    ("reported", "explained", "curved"),
+    [([], True, False), ([], False, False), (["feedback"], True, False), ([], True, True)],
+)
+def test_what_is_explained_is_taken_back_and_said(
+    reported: list[str], explained: bool, curved: bool
+) -> None:
+    """But where feedback is reported, which no fit mends, and of models with functions."""
     rounds: Any = type("Rounds", (), {})()
     rounds.effects, rounds.explained = EFFECTS, lambda fit, known: explained
     watch: Any = type("Watch", (), {"stop": lambda self, stage: None})()
     course: Any = SearchState.__new__(SearchState)
     course.rounds, course.watch, course.added, course.quiet = rounds, watch, [], False
-    course.reported, course.notes, course.current, course.plain = reported, [], None, None
+    course.reported, course.notes, course.plain = reported, [], None
+    course.current = SimpleNamespace(model=SimpleNamespace(has_function=curved))
     course.rest, course.left_without = Left(("this",), (0.01,)), ("that",)
     course.explain()
-    taken = explained and not reported
+    taken = explained and not reported and not curved
     assert course.rest == Left(() if taken else ("this",), (0.01,))
     assert course.left_without == (() if taken else ("that",))
     assert [note.split()[0] for note in course.notes] == (["this", "that"] if taken else [])
