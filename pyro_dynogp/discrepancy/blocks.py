@@ -114,18 +114,6 @@ def blocks_of(
     return Blocks(cleared[:second], held_out, cleared[second:], refit, sentence, tuple(found))
 
 
-def shared(held_out: np.ndarray, stretches: int) -> np.ndarray:
-    """Every other stretch of the block that is searched (n,), the last one among them.
-
-    The rest of it is for the fit, where something happens that only that block shows.
-    """
-    rows = np.flatnonzero(held_out)
-    number = np.arange(len(rows)) * stretches // len(rows)
-    out = np.zeros_like(held_out)
-    out[rows[number % 2 == 1]] = True
-    return out
-
-
 def with_candidates(record: Record, candidates: Record | None) -> Record:
     """The record with the channels of another one on the same times as extra channels.
 

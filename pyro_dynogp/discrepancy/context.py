@@ -11,11 +11,12 @@ import numpy as np
 
 from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.discrepancy.blocks import Blocks, shared
+from pyro_dynogp.discrepancy.blocks import Blocks
 from pyro_dynogp.discrepancy.decision import Confirmed, confirm
 from pyro_dynogp.discrepancy.held_out import certain, forecast_density, forecast_errors, without
 from pyro_dynogp.discrepancy.residuals import free_run_of, residuals_of
 from pyro_dynogp.discrepancy.search import Found, look, rated
+from pyro_dynogp.discrepancy.stretches import latest, shared
 from pyro_dynogp.effects import Effect
 from pyro_dynogp.inference.refit import refit
 from pyro_dynogp.inference.run import Run
@@ -274,10 +275,10 @@ class SearchContext:
         """Give parts of B to the fit where an effect begins there; whether that was needed."""
         if not winner.effect.localised or (self.held_out != self.data.held_out).any():
             return False
-        begin = self.data.known.time[int(np.argmax(self.held_out))]
-        if float(winner.evidence.where.get("time", -np.inf)) < begin:
+        begin = latest([winner.evidence], self.data.known)
+        if begin < int(np.argmax(self.held_out)):
             return False
-        self.held_out = shared(self.held_out, self.settings.stretches)
+        self.held_out = shared(self.held_out, self.settings.stretches, begin)
         return True
 
     def left(self, looked: Tested) -> Left:

@@ -14,6 +14,7 @@ from pyro_dynogp.discrepancy.judged import Judged, kind_of
 from pyro_dynogp.discrepancy.refits import Refits
 from pyro_dynogp.discrepancy.result import Attempt
 from pyro_dynogp.discrepancy.search import Candidate, Found
+from pyro_dynogp.discrepancy.stretches import latest
 from pyro_dynogp.fitting import Fit
 from pyro_dynogp.inference.bayes_factor import VERY_STRONG, counted, log_evidence_of
 from pyro_dynogp.models.variants import Model
@@ -72,10 +73,13 @@ def confirm(
         late: says whether the time limit has passed; None for none. A round that it cuts short adds
             nothing: what was refitted is not compared with all others.
     """
-    refits = Refits(current, record, held_out, number, seed, settings, workers, progress, late)
+    begin = latest([one.evidence for one, _ in candidates if one.effect.localised], record)
+    refits = Refits(
+        current, record, held_out, number, seed, settings, workers, progress, late, begin
+    )
     structure = [one for one in candidates if kind_of(one[0])[1] == "forecast"]
     sure = [one for one in structure if one[0].q_value <= level]
-    judged = refits.settled(refits.judge(sure), level)
+    judged = refits.by_evidence(refits.settled(refits.judge(sure), level), level)
     certain = {one.found.effect.family for one in judged if one.helps}
     judged += refits.judge([
         one for one in structure
@@ -85,7 +89,8 @@ def confirm(
         first = confirmed_together(refits, judged, level)
         judged = [first if first and one.found is first.found else one for one in judged]
     if not _confirms(judged, level):
-        judged += refits.judge([one for one in candidates if one not in structure])
+        noise = [one for one in candidates if one not in structure]
+        judged += refits.by_evidence(refits.judge(noise), level)
     places = {id(found): place for place, (found, _) in enumerate(candidates)}
     judged = sorted(judged, key=lambda one: places[id(one.found)])
     done = [id(one.found) for one in judged]

@@ -8,6 +8,7 @@ from scipy.special import logsumexp
 from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.criticism.densities import pointwise_log_density
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.discrepancy.stretches import stretches
 from pyro_dynogp.effects.base import Score
 from pyro_dynogp.fitting import Fit
 from pyro_dynogp.models.outputs import output_process
@@ -88,18 +89,3 @@ def certain(gains: np.ndarray, settings: LoopSettings) -> bool:
     """Whether gains (N,) of single samples are certainly more than nothing in all [nats]."""
     error = settings.standard_errors * block_standard_error(gains)[0]
     return bool(gains.sum() > max(settings.gain, error))
-
-
-def stretches(mask: np.ndarray) -> list[slice]:
-    """Stretches of samples for which a mask (n,) holds."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
-    return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-
-
-def interleaved(count: int, blocks: int) -> tuple[np.ndarray, ...]:
-    """Two folds (n,): every other block of a record, and those between but for the first.
-
-    What happens at one instant has data on either side of it in both.
-    """
-    number = np.arange(count) * blocks // max(count, 1)
-    return (number % 2 == 1), ((number % 2 == 0) & (number > 0))

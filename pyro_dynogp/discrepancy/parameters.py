@@ -10,7 +10,15 @@ import numpy as np
 from torch import Tensor
 
 from pyro_dynogp.criticism.posterior_draws import draws_of
-from pyro_dynogp.data.channels import Channel, Delayed, Quantity, count_direct, prepared
+from pyro_dynogp.data.channels import (
+    Channel,
+    Delayed,
+    Quantity,
+    Step,
+    StepOfGain,
+    count_direct,
+    prepared,
+)
 from pyro_dynogp.data.channels.base import unit_of
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.effects.base import Parameters
@@ -100,19 +108,25 @@ def _gains(fit: Fit, channels: Sequence[Channel], drawn: Mapping[str, Tensor]) -
 
 
 def _together(channels: Sequence[Channel]) -> list[list[Channel]]:
-    """Channels with given numbers; those that share one dead time in one group."""
+    """Channels with given numbers; those that share one dead time, or one instant, in one group."""
     groups: list[list[Channel]] = []
     late = [one for one in channels if isinstance(one, Delayed) and one.free]
     for one in channels:
         if not one.numbers or one in late:
             continue
-        shared = [g for g in groups if isinstance(one, Delayed) and isinstance(g[0], Delayed)
-                  and g[0].delay == one.delay]  # fmt: skip
-        if shared:
-            shared[0].append(one)
+        shared = next((g for g in groups if _shared(one) and _shared(one) == _shared(g[0])), None)
+        if shared is not None:
+            shared.append(one)
         else:
             groups.append([one])
     return groups
+
+
+def _shared(channel: Channel) -> tuple[str, float] | None:
+    """What a channel may share with others: a dead time, or an instant."""
+    if isinstance(channel, Delayed) and channel.delay is not None:
+        return ("delay", channel.delay)
+    return ("at", channel.at) if isinstance(channel, Step | StepOfGain) else None
 
 
 def _numbers(fit: Fit, group: Sequence[Channel], record: Record) -> Parameters:

@@ -12,9 +12,9 @@ import joblib
 import numpy as np
 
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.discrepancy.held_out import interleaved
-from pyro_dynogp.discrepancy.judged import SPREAD, Judged, Kind, judge, kind_of
+from pyro_dynogp.discrepancy.judged import SETTLED_BY, SPREAD, Judged, Kind, judge, kind_of
 from pyro_dynogp.discrepancy.search import Candidate, Found
+from pyro_dynogp.discrepancy.stretches import interleaved
 from pyro_dynogp.discrepancy.trials import Trial, Tried, run, with_substeps
 from pyro_dynogp.fitting import Fit
 from pyro_dynogp.inference.bayes_factor import VERY_STRONG, log_evidence_of
@@ -34,7 +34,9 @@ class Refits:
         current: fit of the model that is extended, to what is not held out.
         record: blocks A and B. held_out: (n,) True in B.
         number: of the round. seed, settings, workers, progress, late: as of `confirm`.
+        begin: sample where the last of the candidates of one instant happens, 0 for none.
         results: of the trials so far, by the models and how they are scored.
+        evidences: of models that are fitted to all known data, by model and samples [nats].
         early: whether the time limit was passed with trials to go.
     """
 
@@ -47,7 +49,9 @@ class Refits:
     workers: int | None
     progress: bool
     late: Callable[[], bool] | None = None
+    begin: int = 0
     results: dict[tuple[str, Kind], Tried] = field(default_factory=dict)
+    evidences: dict[tuple[str, int], float] = field(default_factory=dict)
     early: bool = False
 
     @cached_property
@@ -70,7 +74,7 @@ class Refits:
         """
         where, score = kind
         known = self.current if found is None and base is None and where == "after" else None
-        spread = interleaved(len(self.record), self.settings.folds)
+        spread = interleaved(len(self.record), self.settings.folds, self.begin)
         folds = spread if where == "spread" else (self.held_out,)
         start = self.current if base is None else base
         plain = Trial(models, self.record, folds, start, self.seed, self.settings, score, fit=known)
@@ -145,17 +149,43 @@ class Refits:
         """
         if one.found.effect.acts_on == "inputs" or one.tried.fit is None or not one.helps:
             return one
+        return one if self.evidence(one) > VERY_STRONG else self._weighed(one, False)
+
+    def by_evidence(self, judged: Sequence[Judged], level: float) -> list[Judged]:
+        """Where nothing helps for certain, what nearly does helps if all known data speak for it.
+
+        Where most of a gain comes from a few stretches of a short block its error is as large, of
+        whatever is right; the residual is certain (see `unsure`) and evidence is very strong.
+        """
+        level = min(level, self.settings.unsure)
+        if any(one.helps for one in judged):
+            return list(judged)
+        return [
+            self._weighed(one, True)
+            if one.attempt.decision == "nearly" and one.found.q_value <= level
+            and one.tried.fit is not None and self.evidence(one) > VERY_STRONG
+            else one
+            for one in judged
+        ]  # fmt: skip
+
+    def _weighed(self, one: Judged, helps: bool) -> Judged:
+        """A candidate that evidence has decided on."""
+        said = f"fitted to all known data, the evidence for it is {self.evidence(one):+.1f} nats"
+        gained = one.attempt.reason.partition(SETTLED_BY)[0]  # no more samples are asked for
+        attempt = replace(one.attempt, reason=f"{gained}; {said}")
+        return replace(one, attempt=attempt, helps=helps)
+
+    def evidence(self, one: Judged) -> float:
+        """Of a candidate over the model without it, both fitted to all known data [nats]."""
+        assert one.tried.fit is not None
         same = comparable(self.record, [self.model, one.tried.model], self.settings.reach)
-        run = Run(self.seed, workers=1)
-        without, extended = (
-            log_evidence_of(refit(fit, same, model=model, run=run))
-            for fit, model in ((self.current, self.model), (one.tried.fit, one.tried.model))
-        )
-        if extended - without > VERY_STRONG:
-            return one
-        said = f"fitted to all known data, the evidence for it is {extended - without:+.1f} nats"
-        attempt = replace(one.attempt, reason=f"{one.attempt.reason}; {said}")
-        return replace(one, attempt=attempt, helps=False)
+        pair = ((self.current, self.model), (one.tried.fit, one.tried.model))
+        for fit, model in pair:
+            if (repr(model), len(same)) not in self.evidences:
+                found = refit(fit, same, model=model, run=Run(self.seed, workers=1))
+                self.evidences[repr(model), len(same)] = log_evidence_of(found)
+        without, extended = (self.evidences[repr(model), len(same)] for _, model in pair)
+        return extended - without
 
     def with_substeps(self, one: Judged) -> Tried:
         """What was kept of a candidate, with substeps where they are better and time is left."""

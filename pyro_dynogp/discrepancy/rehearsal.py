@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.discrepancy.held_out import forecast_errors, stretches, without
+from pyro_dynogp.discrepancy.held_out import forecast_errors, without
+from pyro_dynogp.discrepancy.stretches import stretches
 from pyro_dynogp.fitting import Fit
 from pyro_dynogp.inference.refit import refit
 from pyro_dynogp.inference.run import Run

@@ -19,6 +19,7 @@ from pyro_dynogp.effects.drift import Drift
 from pyro_dynogp.effects.dynamics import UnmodelledDynamics
 from pyro_dynogp.effects.extra_input import ExtraInput
 from pyro_dynogp.effects.feedback import Feedback
+from pyro_dynogp.effects.gain_shift import GainShift
 from pyro_dynogp.effects.heavy_tails import HeavyTails
 from pyro_dynogp.effects.heteroscedastic import HeteroscedasticNoise
 from pyro_dynogp.effects.hysteresis import Hysteresis
@@ -36,6 +37,6 @@ __all__ = ["CATALOGUE", "Effect"]
 CATALOGUE: tuple[Effect, ...] = (
     ExtraInput(), DeadTime(), UnmodelledDynamics(), Integrator(), OutputNonlinearity(),
     InputNonlinearity(), NonlinearFeedbackOfOutput(), Saturation(), DeadZoneOfInput(),
-    Hysteresis(), Drift(), LevelShift(), PeriodicDisturbance(), CalendarEffect(), ClockShift(),
-    HeavyTails(), HeteroscedasticNoise(), ProcessNoise(), Feedback(),
+    Hysteresis(), Drift(), LevelShift(), GainShift(), PeriodicDisturbance(), CalendarEffect(),
+    ClockShift(), HeavyTails(), HeteroscedasticNoise(), ProcessNoise(), Feedback(),
 )  # fmt: skip

@@ -17,12 +17,10 @@ from pyro_dynogp.statistics.evidence import Evidence, Residuals
 from pyro_dynogp.statistics.pictures import about, evidence, over_time
 from pyro_dynogp.statistics.prewhitening import free_columns, prewhitened, spanning
 from pyro_dynogp.statistics.settings import LoopSettings
-from pyro_dynogp.statistics.shares_of_inputs import paths
+from pyro_dynogp.statistics.shares_of_inputs import contributions
 
 # Cosines of a drift: the slowest runs once from one end to the other, the fastest four times.
 SLOW = ((1,), (1, 2), (1, 2, 3, 4))
-# Inputs beyond which a drift of gain is looked for in the mean as a whole only.
-INPUTS = 4
 # Ramps of a path of gain, and the share of the record at which the last one ends: the path begins
 # in what a search trains on, two thirds of what it knows, and is held from there.
 RAMPS, LAST = 4, 2 / 3
@@ -44,26 +42,18 @@ def drift(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> Evi
     r = residuals
     t = (r.time - r.time[0]) / (r.time[-1] - r.time[0])
     slow = np.cos(np.pi * t[:, None] * np.arange(1, SLOW[-1][-1] + 1))
-    names, scaled = [""], [np.ones(len(r))]
-    mean = r.mean - r.mean.mean()
-    nuisance = mean[:, None]
-    if mean.std() > 0:
-        names, scaled = [*names, r.output_name], [*scaled, mean]
-    if 2 <= len(r.input_names) <= INPUTS:
-        shares = paths(r).shares
-        nuisance = np.column_stack([nuisance, shares])
-        names = [*names, *r.input_names]
-        scaled = [*scaled, *(shares - shares.mean(0)).T]
+    gains, signals = contributions(r)
+    names, scaled = ["", *gains], [np.ones(len(r)), *signals.T]
     K = slow.shape[1]
     columns = np.concatenate([slow * s[:, None] for s in scaled], axis=1)
     places = [np.array(k) - 1 + K * j for j in range(len(scaled)) for k in SLOW]
     scan = prewhitened(
         r.residual,
         free_columns(columns, places),
-        spanning(nuisance),
+        spanning(signals),
         r.deviations,
         settings,
-        first=np.column_stack([columns, nuisance]),
+        first=np.column_stack([columns, signals]),
         seed=seed,
     )
     j, order = divmod(scan.best, len(SLOW))

@@ -15,6 +15,8 @@ from pyro_dynogp.statistics.regression import with_past
 from pyro_dynogp.statistics.responses import filtered, responses, standardised, time_constants
 from pyro_dynogp.support.errors import invalid
 
+# Inputs beyond which gains are looked at in the mean as a whole only.
+INPUTS = 4
 # Order of the difference equation whose poles are tried, and columns beyond which fewer are used.
 ORDER, COLUMNS = 6, 240
 
@@ -80,6 +82,24 @@ def paths(residuals: Residuals) -> Paths:
     weights = weights.reshape(n_u, K)
     shares = np.einsum("njk,jk->nj", columns, weights) if n_u != 1 else mean[:, None]
     return Paths(r.time, r.step, rates, lags, weights, shares)
+
+
+def contributions(residuals: Residuals) -> tuple[list[str], np.ndarray]:
+    """What gains act on: the mean as a whole, and what each of a few inputs contributes to it.
+
+    Returns:
+        Names of the output and of the inputs, and the deviation of each from its average (n, K)
+        [output]; nothing where the mean is constant.
+    """
+    r = residuals
+    names, signals = [r.output_name], [r.mean - r.mean.mean()]
+    if not signals[0].std() > 0:
+        return [], np.zeros((len(r), 0))
+    if 2 <= len(r.input_names) <= INPUTS:
+        shares = paths(r).shares
+        names += r.input_names
+        signals += list((shares - shares.mean(0)).T)
+    return names, np.column_stack(signals)
 
 
 def _poles(residuals: Residuals) -> np.ndarray:

@@ -44,6 +44,7 @@ ALL = [
     channels.ShiftedClock("load", 1.0, (10.0, 20.0)),
     channels.Ramp(5.0, 12.0),
     channels.RampOfGain("load", 0.1, 5.0, 12.0),
+    channels.StepOfGain("load", 0.1, 8.0),
 ]
 
 
@@ -135,6 +136,18 @@ def test_ramps_make_a_path_that_is_held() -> None:
     gains = [channels.RampOfGain("load", 0.1, *ends).columns(own)[:, 0] for ends in pairs]
     expected = (own.inputs[:, 1] - 0.1) * level
     np.testing.assert_allclose(np.column_stack(gains) @ np.diff(levels), expected, atol=1e-12)
+
+
+def test_a_gain_steps_with_the_level_of_its_centre() -> None:
+    own = record()
+    at = float(own.time[7])
+    gain, level = channels.StepOfGain("load", 0.1, at), channels.Step(at)
+    before, after = np.zeros(7), own.inputs[7:, 1] - 0.1
+    np.testing.assert_array_equal(gain.columns(own)[:, 0], np.concatenate([before, after]))
+    assert gain.columns(own).shape == level.columns(own).shape
+    assert gain.names == (f"load from {at:.9g}",)
+    assert not gain.direct
+    assert level.direct
 
 
 def test_a_dead_zone_leaves_what_lies_beyond() -> None:

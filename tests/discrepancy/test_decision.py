@@ -15,9 +15,7 @@ from pyro_dynogp import effects
 from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.data.channels import Calendar, Delayed, ShiftedClock
 from pyro_dynogp.discrepancy import refits
-from pyro_dynogp.discrepancy.blocks import shared
 from pyro_dynogp.discrepancy.decision import _first_in_line, _specific, _too_special, confirm
-from pyro_dynogp.discrepancy.held_out import interleaved, stretches
 from pyro_dynogp.discrepancy.judged import Judged, enough_samples, judge
 from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.discrepancy.trials import Tried
@@ -200,23 +198,6 @@ def test_gains_of_nothing_seldom_count(freedom: float) -> None:
     assert binom.sf(count - 1, 1000, 0.04) > 1e-3
 
 
-def test_folds_have_data_on_either_side_of_every_instant() -> None:
-    first, second = interleaved(240, SETTINGS.folds)
-    assert not (first & second).any()
-    assert not (first | second)[:20].any()  # the past of the first forecast
-    assert [part.stop - part.start for part in stretches(first)] == [20] * 6
-    assert stretches(np.array([True, False, True, True])) == [slice(0, 1), slice(2, 4)]
-
-
-def test_half_of_the_block_that_is_searched_can_be_fitted_to() -> None:
-    held_out = np.arange(480) >= 240
-    some = shared(held_out, SETTINGS.stretches)
-    assert some.sum() == 120
-    assert some[-1]
-    assert not some[:240].any()
-    assert not some[240]
-
-
 def test_a_line_of_a_day_is_named_after_the_calendar() -> None:
     """Where there are time stamps, and both explain the same."""
     plain = machine(seed=3)
@@ -316,6 +297,8 @@ def test_pairs_are_tried_where_no_structure_is_certain(
 
         def settled(self, judged: Any, level: float) -> Any:
             return judged
+
+        by_evidence = settled
 
         def on_one_scale(self, better: Any) -> Any:
             return better

@@ -15,9 +15,11 @@ from pyro_dynogp.data.channels import (
     ShiftedClock,
     Sinusoid,
     Step,
+    StepOfGain,
+    Trend,
 )
 from pyro_dynogp.data.signals import dead_zone, delayed, play
-from pyro_dynogp.discrepancy.parameters import parameters_of
+from pyro_dynogp.discrepancy.parameters import _together, parameters_of
 from pyro_dynogp.effects import OutputNonlinearity, Saturation
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.laplace import log_evidence
@@ -245,3 +247,12 @@ def test_weights_of_cascades_have_standard_deviations_too():
     found = parameters_of(fit, [step], record)
     (weight,) = (pair for label, pair in found.items() if label.startswith("step"))
     assert 0.003 < weight[1] < 0.5
+
+
+def test_a_gain_and_the_level_that_step_at_once_have_one_instant():
+    gain, other, level = StepOfGain("u", 0.0, 40.0), StepOfGain("v", 0.0, 40.0), Step(40.0)
+    later, zone = Step(50.0), DeadZone("u", -1.0, 1.0)
+    late = [Delayed("u", 3.0), Delayed("v", 3.0), Delayed("w", 4.0)]
+    free = Delayed("x")
+    groups = _together([gain, *late, other, Trend(0.0, 1.0), level, zone, later, free])
+    assert groups == [[gain, other, level], late[:2], late[2:], [zone], [later]]

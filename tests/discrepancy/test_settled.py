@@ -15,6 +15,7 @@ from pyro_dynogp.discrepancy.decision import confirm
 from pyro_dynogp.discrepancy.judged import SPREAD, Judged, judge, kind_of
 from pyro_dynogp.discrepancy.refits import Refits
 from pyro_dynogp.discrepancy.trials import Tried
+from pyro_dynogp.inference.bayes_factor import VERY_STRONG
 from tests.discrepancy.made import SETTINGS
 from tests.discrepancy.test_decision import spoken_for
 from tests.discrepancy.test_joint_refits import SAMPLES, tried
@@ -214,3 +215,62 @@ def test_a_lower_level_asks_for_more() -> None:
     one, scored = candidate(INPUT, 19.0, 10.0, q=0.009), refits(WELL)
     assert scored.settled([one], 0.008) == [one]
     assert scored.settled([one], 0.0095)[0].helps
+
+
+@pytest.mark.parametrize(
+    ("gain", "q", "evidence", "other", "helps"),
+    [
+        (17.0, 1e-4, VERY_STRONG + 0.1, False, True),
+        (17.0, 1e-4, VERY_STRONG - 0.1, False, False),
+        (14.0, 1e-4, VERY_STRONG + 0.1, False, False),  # not nearly
+        (17.0, 0.0099, VERY_STRONG + 0.1, False, True),
+        (17.0, 0.0101, VERY_STRONG + 0.1, False, False),  # the residual has its doubts
+        (17.0, 1e-4, VERY_STRONG + 0.1, True, False),  # another one helps for certain
+    ],
+)
+def test_what_nearly_helps_is_settled_by_the_evidence_of_all_known_data(
+    monkeypatch: pytest.MonkeyPatch,
+    gain: float,
+    q: float,
+    evidence: float,
+    other: bool,
+    helps: bool,
+) -> None:
+    monkeypatch.setattr(Refits, "evidence", lambda self, one: evidence)
+    fit: Any = object()
+    one = candidate(INPUT, gain, 10.0, q=q)
+    one = replace(one, tried=replace(one.tried, fit=fit))
+    judged = [one, *([candidate(DELAY, 30.0, 10.0)] if other else [])]
+    first, *_ = refits(NOTHING).by_evidence(judged, 0.05)
+    assert first.helps is helps
+    if helps:
+        assert first.attempt.reason.endswith("the evidence for it is +5.1 nats")
+        assert "would settle it" not in first.attempt.reason
+    else:
+        assert first is one
+    unfitted = candidate(INPUT, 17.0, 10.0)
+    assert refits(NOTHING).by_evidence([unfitted], 0.05) == [unfitted]
+
+
+def test_noise_that_nearly_helps_is_settled_so_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the candidates of a round those of the noise come after the structure."""
+    asked: list[list[str]] = []
+
+    def by_evidence(self: Any, judged: list[Judged], level: float) -> list[Judged]:
+        asked.append([one.found.effect.name for one in judged])
+        return judged
+
+    monkeypatch.setattr(Refits, "by_evidence", by_evidence)
+    monkeypatch.setattr(Refits, "judge", lambda self, some: [
+        replace(candidate(found.effect, 17.0, 10.0), found=found) for found, _ in some
+    ])  # fmt: skip
+    monkeypatch.setattr(Refits, "settled", lambda self, judged, level: list(judged))
+    current: Any = type("Current", (), {"model": MODEL})
+    record: Any = range(480)
+    tails = spoken_for(effects.HeavyTails(), 1e-9, 1e-8)
+    delay = spoken_for(DELAY, 1e-9, 1e-8)
+    confirm(
+        [(delay, (MODEL,)), (tails, (MODEL,))], current, record, np.arange(480) >= 240,
+        number=1, seed=0, level=0.05, settings=SETTINGS, workers=1,
+    )  # fmt: skip
+    assert asked == [["dead time"], ["heavy tails"]]

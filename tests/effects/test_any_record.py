@@ -12,6 +12,7 @@ from pyro_dynogp.effects.dead_zone import dead_zone
 from pyro_dynogp.effects.drift import drift
 from pyro_dynogp.effects.dynamics import unmodelled_dynamics
 from pyro_dynogp.effects.feedback import feedback
+from pyro_dynogp.effects.gain_shift import gain_shift
 from pyro_dynogp.effects.heavy_tails import heavy_tails
 from pyro_dynogp.effects.heteroscedastic import heteroscedastic_noise
 from pyro_dynogp.effects.hysteresis import hysteresis
@@ -106,7 +107,7 @@ def test_units_and_order_do_not_matter_of_noise(detector):
 
 
 @pytest.mark.parametrize(
-    "detector", [drift, level_shift, periodic_disturbance, of_the_week, clock_shift]
+    "detector", [drift, level_shift, gain_shift, periodic_disturbance, of_the_week, clock_shift]
 )
 def test_units_and_order_do_not_matter_of_time(detector):
     r = residuals(0, 400, inputs=2, step=1.0, stamps=stamps(400), deviation=0.02, effect=gain_drift)
@@ -118,6 +119,8 @@ def test_units_and_order_do_not_matter_of_time(detector):
             assert other.where[key] == pytest.approx(60.0 * value, rel=1e-6)
         elif key == "size":
             assert other.where[key] == pytest.approx(1e-3 * value, rel=1e-6)
+        elif key == "ratio":
+            assert other.where[key] == pytest.approx(value, rel=1e-6)
         elif key == "time_unit":
             assert (value, other.where[key]) == ("s", "min")
         else:
@@ -137,7 +140,7 @@ def test_gaps_and_irregular_steps(detector):
     assert found.sentence.endswith(".")
 
 
-@pytest.mark.parametrize("detector", [drift, level_shift, of_the_week, clock_shift])
+@pytest.mark.parametrize("detector", [drift, level_shift, gain_shift, of_the_week, clock_shift])
 def test_irregular_steps_and_gaps(detector):
     generator = np.random.default_rng(0)
     r = residuals(0, 400, step=1.0, stamps=stamps(400))

@@ -11,6 +11,7 @@ from pyro_dynogp.effects.dead_zone import dead_zone
 from pyro_dynogp.effects.drift import drift
 from pyro_dynogp.effects.dynamics import unmodelled_dynamics
 from pyro_dynogp.effects.feedback import feedback
+from pyro_dynogp.effects.gain_shift import gain_shift
 from pyro_dynogp.effects.heavy_tails import heavy_tails
 from pyro_dynogp.effects.heteroscedastic import heteroscedastic_noise
 from pyro_dynogp.effects.hysteresis import hysteresis
@@ -62,7 +63,9 @@ class TestNoise:
 
 
 class TestTime:
-    @pytest.mark.parametrize("detector", [drift, level_shift, periodic_disturbance, clock_shift])
+    @pytest.mark.parametrize(
+        "detector", [drift, level_shift, gain_shift, periodic_disturbance, clock_shift]
+    )
     def test_level_is_kept(self, detector):
         check_rate(
             [detector(residuals(s, 150, deviation=0.02), FEW, seed=s).p_value for s in range(100)]

@@ -14,6 +14,7 @@ from pyro_dynogp.data.channels.clock import (
     ShiftedClock,
     Sinusoid,
     Step,
+    StepOfGain,
     Trend,
     TrendOfGain,
 )
@@ -41,6 +42,7 @@ __all__ = [
     "ShiftedClock",
     "Sinusoid",
     "Step",
+    "StepOfGain",
     "Transformed",
     "Trend",
     "TrendOfGain",

@@ -37,6 +37,26 @@ class Step(Channel):
 
 
 @dataclass(frozen=True)
+class StepOfGain(Channel):
+    """An input from an instant on: a gain that shifts.
+
+    Args: channel: name of the input. centre: subtracted from it first [input]. at: [time unit].
+    """
+
+    numbers: ClassVar[Mapping[str, Quantity]] = {"at": Quantity("instant", "time", inside=True)}
+    channel: str
+    centre: float
+    at: float
+
+    def _names(self) -> tuple[str, ...]:
+        return (f"{self.channel} from {self.at:.9g}",)
+
+    def _columns(self, record: Record) -> np.ndarray:
+        x = signal_of(record, self.channel) - self.centre
+        return np.where(record.time >= self.at, x, 0.0)
+
+
+@dataclass(frozen=True)
 class Trend(Channel):
     """A straight line in time that goes from 0 at `begin` to 1 at `end` [time unit], and on."""
 

@@ -17,6 +17,7 @@ from pyro_dynogp.data.channels.clock import (
     ShiftedClock,
     Sinusoid,
     Step,
+    StepOfGain,
     Trend,
     TrendOfGain,
 )
@@ -27,8 +28,8 @@ from pyro_dynogp.data.record import Record
 KINDS: dict[str, type[Channel]] = {
     kind.__name__: kind
     for kind in (
-        Recorded, Delayed, DeadZone, Play, Transformed, Product, Step, Trend, TrendOfGain,
-        Ramp, RampOfGain, Sinusoid, Calendar, ShiftedClock,
+        Recorded, Delayed, DeadZone, Play, Transformed, Product, Step, StepOfGain, Trend,
+        TrendOfGain, Ramp, RampOfGain, Sinusoid, Calendar, ShiftedClock,
     )
 }  # fmt: skip
 

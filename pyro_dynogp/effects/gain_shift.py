@@ -1,0 +1,142 @@
+"""A gain that jumps at one instant."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+
+from pyro_dynogp.data.channels import Step, StepOfGain
+from pyro_dynogp.data.record import Record
+from pyro_dynogp.effects.base import Effect, centre_of, number_of
+from pyro_dynogp.models.variants import Model, with_channel
+from pyro_dynogp.statistics.evidence import Evidence, Residuals
+from pyro_dynogp.statistics.pictures import about, evidence, instant, over_time
+from pyro_dynogp.statistics.prewhitening import Projection, prewhitened, spanning
+from pyro_dynogp.statistics.settings import LoopSettings
+from pyro_dynogp.statistics.shares_of_inputs import contributions, paths
+from pyro_dynogp.statistics.steps import instants, stairs, steps
+from pyro_dynogp.support.errors import invalid
+
+
+def gain_shift(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> Evidence:
+    """A step of a gain at any instant, looked for in the whole record.
+
+    From the instant on the output has a share of what the model says about its average, or of what
+    one input contributes to it.
+
+    Returns:
+        where: time (of the first sample with the new gain) [time unit], channel (the input whose
+            gain steps, or the output where that of all does), ratio (of the new gain to the old).
+
+    Raises:
+        ValueError: where the model's mean is constant.
+
+    Source: largest F statistic over the instant, Andrews, Econometrica 61(4):821 (1993), of a
+    coefficient that changes once, Chow, Econometrica 28(3):591 (1960); the null by `prewhitened`.
+    """
+    r = residuals
+    names, signals = contributions(r)
+    if not names:
+        raise invalid("residuals", expected="a mean that moves", got="a constant one")
+    places = instants(len(r), settings.step_margin)
+    nuisance = spanning(signals)
+    scan = prewhitened(
+        r.residual,
+        steps(signals, places),
+        nuisance,
+        r.deviations,
+        settings,
+        first=np.column_stack([stairs(signals), nuisance]),
+        seed=seed,
+    )
+    k, place = divmod(scan.best, len(places))
+    of = range(r.inputs.shape[1]) if k == 0 else [r.input_names.index(names[k])]
+    under = Projection(scan.whitener, nuisance, ~np.isfinite(r.residual), settings)
+    at, share, fitted = _nearby(r, of, under, places, int(places[place]))
+    way = "up" if share > 0 else "down"
+    return evidence(
+        "gain shift",
+        scan,
+        {"time": float(r.time[at]), "channel": names[k], "ratio": 1.0 + share},
+        f"The gain of {names[k]!r} steps {way} to {1.0 + share:.3g} times what it was "
+        f"at {instant(r, at)}: {about(r, scan.size)}.",
+        over_time(r, fitted),
+    )
+
+
+def _nearby(
+    residuals: Residuals, of: Sequence[int], under: Projection, places: np.ndarray, at: int
+) -> tuple[int, float, np.ndarray]:
+    """The instant near one at which a step fits best that goes through the model's own dynamics.
+
+    A product with the mean begins at once where the response to the input begins slowly: by about
+    a time constant the instant is wrong. Whatever input does nothing, so that the level may step as
+    well, all of `places` within a tenth of the record are tried: first some of them, then those
+    between.
+
+    Args:
+        of: inputs whose gain steps. under: the filter, and what the step may not claim.
+        places: samples where it may be. at: where the scan found it.
+
+    Returns:
+        The sample, by which share the gain changes, and what the step explains (n,) [output].
+    """
+    r, path = residuals, paths(residuals)
+    ones = np.ones(len(r))
+    signals = [(j, r.inputs[:, j] - np.nanmean(r.inputs[:, j])) for j in of]
+    e, row = under(r.residual), np.arange(len(r))
+    within = len(r) // 10
+
+    def responses(signals: Sequence[tuple[int, np.ndarray]], places: np.ndarray) -> np.ndarray:
+        """Of signals that begin at each place, through the paths of their inputs, (n, M)."""
+        begun = row[:, None] >= places
+        return np.sum([path(j, np.where(begun, x[:, None], 0.0)) for j, x in signals], axis=0)
+
+    for stride in (max(within // 30, 1), 1):
+        around = np.arange(at - within, at + within + 1, stride)
+        around = around[(around >= places[0]) & (around <= places[-1])]
+        gain, level = responses(signals, around), responses([(j, ones) for j in of], around)
+        pairs = np.stack([under(gain), under(level)], axis=2).swapaxes(0, 1)
+        weights = np.linalg.pinv(pairs, rcond=1e-6) @ e
+        left = np.square(e - np.einsum("jmk,jk->jm", pairs, weights)).sum(1)
+        best = int(np.argmin(left))
+        at, within = int(around[best]), stride
+    fitted = weights[best, 0] * gain[:, best] + weights[best, 1] * level[:, best]
+    return at, float(weights[best, 0]), fitted
+
+
+class GainShift(Effect):
+    """A gain that jumps at one instant."""
+
+    name = "gain shift"
+    family = "time"
+    localised = True
+    compared = "held out"
+    experiments: ClassVar = {
+        "drift": "the same input once more",
+        "level shift": "a record at two sizes of the input",
+    }
+    test = staticmethod(gain_shift)
+
+    def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
+        """The input, or each of them, from the instant on as another input; its level as well.
+
+        A gain that steps moves the level by as much as the input is away from where it does
+        nothing. That is its zero, or else there is a variant with a step of the level, which has to
+        be certainly better.
+        """
+        at, channel = number_of(evidence, "time"), evidence.where["channel"]
+        prepared = model.check(record)[0]
+        driving = prepared.input_names[: prepared.n_inputs - model.direct]
+        of = [name for name in driving if name == channel] or [
+            name for name in driving if name in record.input_names
+        ]
+        about_zero = [StepOfGain(name, 0.0, at) for name in of]
+        about_mean = [StepOfGain(name, centre_of(prepared, name), at) for name in of]
+        return [
+            functools.reduce(with_channel, channels, model)
+            for channels in (about_zero, [*about_mean, Step(at)])
+        ]
