@@ -20,6 +20,11 @@ from pyro_dynogp.statistics.shares_of_inputs import contributions, paths
 from pyro_dynogp.statistics.steps import instants, stairs, steps
 from pyro_dynogp.support.errors import invalid
 
+# Of instants that are tried around one, by how much they are closer each time.
+NARROWER = 30
+# Signals that are filtered at once.
+AT_ONCE = 8
+
 
 def gain_shift(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> Evidence:
     """A step of a gain at any instant, looked for in the whole record.
@@ -55,7 +60,8 @@ def gain_shift(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -
     k, place = divmod(scan.best, len(places))
     of = range(r.inputs.shape[1]) if k == 0 else [r.input_names.index(names[k])]
     under = Projection(scan.whitener, nuisance, ~np.isfinite(r.residual), settings)
-    at, share, fitted = _nearby(r, of, under, places, int(places[place]))
+    within = len(r) // 10 if scan.p_value < settings.noticed else 0
+    at, share, fitted = _nearby(r, of, under, places, int(places[place]), within)
     way = "up" if share > 0 else "down"
     return evidence(
         "gain shift",
@@ -68,44 +74,53 @@ def gain_shift(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -
 
 
 def _nearby(
-    residuals: Residuals, of: Sequence[int], under: Projection, places: np.ndarray, at: int
+    residuals: Residuals,
+    of: Sequence[int],
+    under: Projection,
+    places: np.ndarray,
+    at: int,
+    within: int,
 ) -> tuple[int, float, np.ndarray]:
     """The instant near one at which a step fits best that goes through the model's own dynamics.
 
     A product with the mean begins at once where the response to the input begins slowly: by about
-    a time constant the instant is wrong. Whatever input does nothing, so that the level may step as
-    well, all of `places` within a tenth of the record are tried: first some of them, then those
-    between.
+    a time constant the instant is wrong. The level may step as well, for whatever input does
+    nothing. Some instants are tried, and then those around the best of them, down to every one.
 
     Args:
         of: inputs whose gain steps. under: the filter, and what the step may not claim.
-        places: samples where it may be. at: where the scan found it.
+        places: samples where it may be. at: where the scan found it. within: how far it may be.
 
     Returns:
         The sample, by which share the gain changes, and what the step explains (n,) [output].
     """
     r, path = residuals, paths(residuals)
-    ones = np.ones(len(r))
-    signals = [(j, r.inputs[:, j] - np.nanmean(r.inputs[:, j])) for j in of]
+    signals = [(j, r.inputs[:, j] - r.inputs[:, j].mean()) for j in of]
+    levels = [(j, np.full(len(r), x.std())) for j, x in signals]
     e, row = under(r.residual), np.arange(len(r))
-    within = len(r) // 10
 
     def responses(signals: Sequence[tuple[int, np.ndarray]], places: np.ndarray) -> np.ndarray:
         """Of signals that begin at each place, through the paths of their inputs, (n, M)."""
-        begun = row[:, None] >= places
-        return np.sum([path(j, np.where(begun, x[:, None], 0.0)) for j, x in signals], axis=0)
+        parts = np.array_split(places, np.arange(AT_ONCE, len(places), AT_ONCE))
+        begun = [row[:, None] >= part for part in parts]
+        return np.sum([
+            np.concatenate([path(j, np.where(some, x[:, None], 0.0)) for some in begun], axis=1)
+            for j, x in signals
+        ], axis=0)  # fmt: skip
 
-    for stride in (max(within // 30, 1), 1):
+    stride = within
+    while True:
+        stride = max(stride // NARROWER, 1)
         around = np.arange(at - within, at + within + 1, stride)
         around = around[(around >= places[0]) & (around <= places[-1])]
-        gain, level = responses(signals, around), responses([(j, ones) for j in of], around)
-        pairs = np.stack([under(gain), under(level)], axis=2).swapaxes(0, 1)
+        columns = np.stack([responses(signals, around), responses(levels, around)], axis=2)
+        pairs = np.stack([under(columns[..., k]) for k in (0, 1)], axis=2).swapaxes(0, 1)
         weights = np.linalg.pinv(pairs, rcond=1e-6) @ e
         left = np.square(e - np.einsum("jmk,jk->jm", pairs, weights)).sum(1)
         best = int(np.argmin(left))
         at, within = int(around[best]), stride
-    fitted = weights[best, 0] * gain[:, best] + weights[best, 1] * level[:, best]
-    return at, float(weights[best, 0]), fitted
+        if stride == 1:
+            return at, float(weights[best, 0]), columns[:, best] @ weights[best]
 
 
 class GainShift(Effect):
@@ -131,8 +146,9 @@ class GainShift(Effect):
         at, channel = number_of(evidence, "time"), evidence.where["channel"]
         prepared = model.check(record)[0]
         driving = prepared.input_names[: prepared.n_inputs - model.direct]
+        made = {n for one in model.channels if isinstance(one, StepOfGain) for n in one.names}
         of = [name for name in driving if name == channel] or [
-            name for name in driving if name in record.input_names
+            name for name in driving if name not in made
         ]
         about_zero = [StepOfGain(name, 0.0, at) for name in of]
         about_mean = [StepOfGain(name, centre_of(prepared, name), at) for name in of]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import pyro_dynogp as dgp
-from pyro_dynogp.data.channels import Step, StepOfGain
+from pyro_dynogp.data.channels import Delayed, Step, StepOfGain
 from pyro_dynogp.effects import Drift, GainShift, LevelShift
 from pyro_dynogp.effects.drift import drift
 from pyro_dynogp.effects.gain_shift import gain_shift
@@ -48,6 +48,13 @@ class TestTest:
         found = gain_shift(r, SETTINGS)
         assert found.where["time"] == pytest.approx(25.0, abs=0.11)
         assert found.where["ratio"] == pytest.approx(0.4, abs=0.03)
+
+    def test_the_unit_of_the_input_does_not_matter(self):
+        r = residuals(2, 500, pole=0.5, effect=weaker)
+        one = gain_shift(r, SETTINGS)
+        other = gain_shift(dataclasses.replace(r, inputs=1e-9 * r.inputs + 3e-9), SETTINGS)
+        assert other.where["time"] == one.where["time"]
+        assert other.where["ratio"] == pytest.approx(one.where["ratio"], rel=1e-4)
 
     def test_the_input_is_named(self):
         def effect(t, mean, u):
@@ -94,6 +101,18 @@ def test_the_inputs_act_otherwise_from_the_instant_on(channel, inputs):
     centre = dict(zip(("u1", "u2"), u.mean(0), strict=True))
     assert [one.centre for one in gains] == pytest.approx([centre[name] for name in inputs])
     assert level == Step(40.0)
+
+
+def test_an_input_that_is_late_and_one_whose_gain_has_stepped_can_step_again():
+    rng = np.random.default_rng(0)
+    record = dgp.Record(np.arange(90) + 10.0, rng.standard_normal(90), rng.standard_normal(90))
+    model = dgp.LinearDynamicGP(1, pairs=1, channels=(Delayed("u", 2.0),))
+    found = Evidence("gain shift", 9.0, 1e-9, 9.0, 0.1, {"time": 40.0, "channel": "y"})
+    once, _ = GainShift().extend(model, found, record)
+    assert once.channels[1:] == (StepOfGain("u delayed", 0.0, 40.0),)
+    again = dataclasses.replace(found, where={"time": 60.0, "channel": "y"})
+    twice, _ = GainShift().extend(once, again, record)
+    assert twice.channels[2:] == (StepOfGain("u delayed", 0.0, 60.0),)
 
 
 @pytest.mark.parametrize(("at", "offset"), [(250, 2.0), (565, 0.0)])
