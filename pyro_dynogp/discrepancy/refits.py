@@ -170,19 +170,30 @@ class Refits:
 
     def _weighed(self, one: Judged, helps: bool) -> Judged:
         """A candidate that evidence has decided on."""
-        said = f"fitted to all known data, the evidence for it is {self.evidence(one):+.1f} nats"
+        gain = self.evidence(one)
+        said = (
+            f"fitted to all known data, the evidence for it is {gain:+.1f} nats"
+            if np.isfinite(gain)
+            else "could not be fitted to all known data"
+        )
         gained = one.attempt.reason.partition(SETTLED_BY)[0]  # no more samples are asked for
         attempt = replace(one.attempt, reason=f"{gained}; {said}")
         return replace(one, attempt=attempt, helps=helps)
 
     def evidence(self, one: Judged) -> float:
-        """Of a candidate over the model without it, both fitted to all known data [nats]."""
+        """Of a candidate over the model without it, both fitted to all known data [nats].
+
+        Minus infinity where one of them cannot be fitted to them.
+        """
         assert one.tried.fit is not None
         same = comparable(self.record, [self.model, one.tried.model], self.settings.reach)
         pair = ((self.current, self.model), (one.tried.fit, one.tried.model))
         for fit, model in pair:
             if (repr(model), len(same)) not in self.evidences:
-                found = refit(fit, same, model=model, run=Run(self.seed, workers=1))
+                try:
+                    found = refit(fit, same, model=model, run=Run(self.seed, workers=1))
+                except ValueError:
+                    return -math.inf
                 self.evidences[repr(model), len(same)] = log_evidence_of(found)
         without, extended = (self.evidences[repr(model), len(same)] for _, model in pair)
         return extended - without

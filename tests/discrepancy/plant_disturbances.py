@@ -1,4 +1,4 @@
-"""Effects that go with time: drift, level shift, periodic disturbance, calendar, clock shift."""
+"""Effects that go with time: drift, shifts of level and gain, periods, calendar, clock shift."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from tests.discrepancy.plant_dynamics import Array
+from tests.discrepancy.plant_dynamics import Array, response
 from tests.discrepancy.plant_setting import LEAD, ZONE, Generator, Setting, standard
 from tests.discrepancy.planting import Planting, inside, outside
 
@@ -33,6 +33,13 @@ def drift(s: Setting, rng: Generator) -> Planting:
 def level_shift(s: Setting, rng: Generator) -> Planting:
     first, sign = int(rng.uniform(0.2, 0.7) * s.samples), float(rng.choice([-1.0, 1.0]))
     return outside(s, sign * (np.arange(s.samples) >= first).astype(float), first=first)
+
+
+def gain_shift(s: Setting, rng: Generator) -> Planting:
+    """All inputs act with another gain from an instant on."""
+    first, sign = int(rng.uniform(0.2, 0.7) * s.samples), float(rng.choice([-1.0, 1.0]))
+    later = np.arange(len(s.u)) - LEAD >= first
+    return inside(s, sign * response(s.system, s.u * later[:, None]), first=first)
 
 
 def periodic_disturbance(s: Setting, rng: Generator) -> Planting:

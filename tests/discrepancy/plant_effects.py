@@ -12,6 +12,7 @@ from tests.discrepancy.plant_disturbances import (
     calendar,
     clock_shift,
     drift,
+    gain_shift,
     level_shift,
     periodic_disturbance,
 )
@@ -222,6 +223,7 @@ PLANTINGS: Mapping[str, Builder] = {
     "hysteresis": _hysteresis,
     "drift": drift,
     "level shift": level_shift,
+    "gain shift": gain_shift,
     "periodic disturbance": periodic_disturbance,
     "calendar": calendar,
     "clock shift": clock_shift,

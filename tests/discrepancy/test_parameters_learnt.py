@@ -133,3 +133,31 @@ def test_evidence_has_to_be_very_strong(
     assert scored.supported(unfitted) is unfitted
     loser = replace(one, helps=False)
     assert scored.supported(loser) is loser
+
+
+def test_what_cannot_be_fitted_to_all_known_data_is_not_added(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scored, one = candidate(late_input(0.0), SHIFT)
+
+    def refused(*_: Any, **__: Any) -> None:
+        raise ValueError("no")
+
+    monkeypatch.setattr(module, "refit", refused)
+    fair = scored.supported(one)
+    assert not fair.helps
+    assert fair.attempt.reason == "held-out elpd +50; could not be fitted to all known data"
+
+
+def test_every_model_is_fitted_to_all_known_data_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    scored, one = candidate(late_input(0.0, step=3.0), SHIFT)
+    fitted = []
+
+    def counting(*given: Any, **options: Any) -> Any:
+        fitted.append(options["model"])
+        return refit(*given, **options)
+
+    monkeypatch.setattr(module, "refit", counting)
+    assert scored.supported(one).helps
+    assert scored.supported(one).helps
+    assert fitted == [scored.model, one.tried.model]
