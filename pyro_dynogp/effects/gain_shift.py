@@ -8,9 +8,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from pyro_dynogp.data.channels import Step, StepOfGain
+from pyro_dynogp.data.channels import Channel, Ramp, RampOfGain, Step, StepOfGain
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.effects.base import Effect, centre_of, number_of
+from pyro_dynogp.effects.base import Effect, centre_of, number_of, unit_of
 from pyro_dynogp.models.variants import Model, with_channel
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
 from pyro_dynogp.statistics.pictures import about, evidence, instant, over_time
@@ -24,6 +24,10 @@ from pyro_dynogp.support.errors import invalid
 NARROWER = 30
 # Signals that are filtered at once.
 AT_ONCE = 8
+# How long a gain may take to change, as shares of the record.
+WIDTHS = (0.1, 0.25, 0.5)
+# Channels that make a gain change.
+SHIFTS = (StepOfGain, RampOfGain)
 
 
 def gain_shift(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> Evidence:
@@ -66,7 +70,12 @@ def gain_shift(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -
     return evidence(
         "gain shift",
         scan,
-        {"time": float(r.time[at]), "channel": names[k], "ratio": 1.0 + share},
+        {
+            "time": float(r.time[at]),
+            "channel": names[k],
+            "ratio": 1.0 + share,
+            "time_unit": r.time_unit,
+        },
         f"The gain of {names[k]!r} steps {way} to {1.0 + share:.3g} times what it was "
         f"at {instant(r, at)}: {about(r, scan.size)}.",
         over_time(r, fitted),
@@ -124,7 +133,7 @@ def _nearby(
 
 
 class GainShift(Effect):
-    """A gain that jumps at one instant."""
+    """A gain that steps at one instant, or changes about it."""
 
     name = "gain shift"
     family = "time"
@@ -140,19 +149,33 @@ class GainShift(Effect):
         """The input, or each of them, from the instant on as another input; its level as well.
 
         A gain that steps moves the level by as much as the input is away from where it does
-        nothing. That is its zero, or else there is a variant with a step of the level, which has to
-        be certainly better.
+        nothing. That is its zero, or else there is a variant with a step of the level. Others take
+        a while, about the instant. Variants beyond the first have to be certainly better.
         """
         at, channel = number_of(evidence, "time"), evidence.where["channel"]
         prepared = model.check(record)[0]
         driving = prepared.input_names[: prepared.n_inputs - model.direct]
-        made = {n for one in model.channels if isinstance(one, StepOfGain) for n in one.names}
+        made = {n for one in model.channels if isinstance(one, SHIFTS) for n in one.names}
         of = [name for name in driving if name == channel] or [
             name for name in driving if name not in made
         ]
-        about_zero = [StepOfGain(name, 0.0, at) for name in of]
-        about_mean = [StepOfGain(name, centre_of(prepared, name), at) for name in of]
-        return [
-            functools.reduce(with_channel, channels, model)
-            for channels in (about_zero, [*about_mean, Step(at)])
+        centres = {name: centre_of(prepared, name) for name in of}
+        first, last = float(record.time[0]), float(record.time[-1])
+        variants: list[list[Channel]] = [
+            [StepOfGain(name, 0.0, at) for name in of],
+            [*(StepOfGain(name, centre, at) for name, centre in centres.items()), Step(at)],
         ]
+        for share in WIDTHS:
+            half = 0.5 * share * (last - first)
+            ends = (max(at - half, first), min(at + half, last))
+            ramps = [RampOfGain(name, centre, *ends) for name, centre in centres.items()]
+            variants.append([*ramps, Ramp(*ends)])
+        return [functools.reduce(with_channel, channels, model) for channels in variants]
+
+    def sentence(self, evidence: Evidence, model: Model) -> str:
+        """How long it takes, where it is no step."""
+        last = [one for one in model.channels if isinstance(one, SHIFTS)][-1]
+        if isinstance(last, StepOfGain):
+            return evidence.sentence
+        took = f"{last.end - last.begin:.3g}{unit_of(evidence)}"
+        return f"{evidence.sentence.replace(' steps ', ' changes ', 1)} It takes {took} about then."

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import pyro_dynogp as dgp
-from pyro_dynogp.data.channels import Delayed, Step, StepOfGain
+from pyro_dynogp.data.channels import Delayed, Ramp, RampOfGain, Step, StepOfGain
 from pyro_dynogp.effects import Drift, GainShift, LevelShift
 from pyro_dynogp.effects.drift import drift
 from pyro_dynogp.effects.gain_shift import gain_shift
@@ -94,13 +94,36 @@ def test_the_inputs_act_otherwise_from_the_instant_on(channel, inputs):
     u = rng.standard_normal((90, 2)) + np.array([3.0, 0.0])
     record = dgp.Record(np.arange(90) + 10.0, u, rng.standard_normal(90))
     found = Evidence("gain shift", 9.0, 1e-9, 9.0, 0.1, {"time": 40.0, "channel": channel})
-    alone, with_level = GainShift().extend(dgp.LinearDynamicGP(2, pairs=1), found, record)
+    alone, with_level, *slow = GainShift().extend(dgp.LinearDynamicGP(2, pairs=1), found, record)
     assert alone.channels == tuple(StepOfGain(name, 0.0, 40.0) for name in inputs)
     *gains, level = with_level.channels
     assert [(one.channel, one.at) for one in gains] == [(name, 40.0) for name in inputs]
     centre = dict(zip(("u1", "u2"), u.mean(0), strict=True))
     assert [one.centre for one in gains] == pytest.approx([centre[name] for name in inputs])
     assert level == Step(40.0)
+    # Within the record, which is of the times 10 to 99.
+    ends = [(35.55, 44.45), (28.875, 51.125), (17.75, 62.25)]
+    for (begin, end), variant in zip(ends, slow, strict=True):
+        *ramps, level = variant.channels
+        assert [type(one) for one in variant.channels] == [RampOfGain] * len(inputs) + [Ramp]
+        assert [one.channel for one in ramps] == inputs
+        assert [one.centre for one in ramps] == pytest.approx([centre[name] for name in inputs])
+        assert {(one.begin, one.end) for one in variant.channels} == {(level.begin, level.end)}
+        assert (level.begin, level.end) == pytest.approx((begin, end))
+    early = dataclasses.replace(found, where={"time": 14.0, "channel": channel})
+    *_, slowest = GainShift().extend(dgp.LinearDynamicGP(2, pairs=1), early, record)
+    assert (slowest.channels[-1].begin, slowest.channels[-1].end) == (10.0, 36.25)
+
+
+def test_it_is_told_how_long_a_change_takes():
+    r = residuals(1, 500, pole=0.5, effect=weaker)
+    found = gain_shift(r, SETTINGS)
+    record = dgp.Record(r.time, r.inputs, r.output, input_names=r.input_names)
+    step, _, ramp, *_ = GainShift().extend(dgp.LinearDynamicGP(1, pairs=1), found, record)
+    assert GainShift().sentence(found, step) == found.sentence
+    told = GainShift().sentence(found, ramp)
+    assert told.startswith("The gain of 'speed' changes down to 0.")
+    assert told.endswith("It takes 24.9 s about then.")
 
 
 def test_an_input_that_is_late_and_one_whose_gain_has_stepped_can_step_again():
@@ -108,10 +131,10 @@ def test_an_input_that_is_late_and_one_whose_gain_has_stepped_can_step_again():
     record = dgp.Record(np.arange(90) + 10.0, rng.standard_normal(90), rng.standard_normal(90))
     model = dgp.LinearDynamicGP(1, pairs=1, channels=(Delayed("u", 2.0),))
     found = Evidence("gain shift", 9.0, 1e-9, 9.0, 0.1, {"time": 40.0, "channel": "y"})
-    once, _ = GainShift().extend(model, found, record)
+    once, *_ = GainShift().extend(model, found, record)
     assert once.channels[1:] == (StepOfGain("u delayed", 0.0, 40.0),)
     again = dataclasses.replace(found, where={"time": 60.0, "channel": "y"})
-    twice, _ = GainShift().extend(once, again, record)
+    twice, *_ = GainShift().extend(once, again, record)
     assert twice.channels[2:] == (StepOfGain("u delayed", 0.0, 60.0),)
 
 
@@ -138,3 +161,22 @@ def test_a_loop_names_it_and_forecasts_are_right_again(at, offset):
     ]  # fmt: skip
     (instant,) = [v for name, v in effect.parameters.items() if name.startswith("instant")]
     assert instant[0] == pytest.approx(at - 0.5, abs=1.0)
+
+
+def test_a_gain_that_changes_for_a_while_is_followed():
+    rng = np.random.default_rng(1)
+    u = np.repeat(rng.standard_normal(80), 10)
+    gain = 1.0 - 0.5 * np.clip((np.arange(800) - 150) / 300.0, 0.0, 1.0)
+    x = np.zeros(800)
+    for k in range(799):
+        x[k + 1] = 0.85 * x[k] + 0.15 * gain[k] * u[k]
+    record = dgp.Record(np.arange(800.0), u, x + 0.02 * rng.standard_normal(800))
+    quick = {"workers": 1, "progress": False}
+    fit = dgp.fit(dgp.LinearDynamicGP(1, pairs=1), record[:400], **quick)
+    report = dgp.close_loop(fit, record, effects=(GainShift(), Drift()), max_rounds=1, **quick)
+    (effect,) = report.effects
+    assert effect.name == "gain shift"
+    assert "changes down to 0." in effect.sentence
+    assert " s about then." in effect.sentence
+    assert report.before["rmse"] > 0.1
+    assert report.after["rmse"] < 0.04  # the noise is 0.02, and how long it takes a coarse guess
