@@ -20,8 +20,8 @@ Where = Literal["after", "spread"]
 Kind = tuple[Where, Score]
 # Of forecasts of blocks that are spread over the record.
 SPREAD: Kind = ("spread", "forecast")
-# What begins the number of samples that would settle a gain.
-SETTLED_BY = "; about "
+# How a reason ends that asks for more samples.
+MORE = "would settle it"
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,7 @@ def judge(
     helps = helps and not harms
     wanted = 0 if helps or harms else enough_samples(gain, error, len(d), enough)
     if wanted:
-        reason += f"{SETTLED_BY}{wanted} samples like these {len(d)} would settle it"
+        reason += f"; about {wanted} samples like these {len(d)} {MORE}"
     decision: Decision = "nearly" if wanted else "rejected"
     attempt = Attempt(number, evidence, q, decision, reason, gain, error, tried.seconds)
     return Judged(found, kind, tried, attempt, helps, harms)

@@ -12,7 +12,7 @@ import joblib
 import numpy as np
 
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.discrepancy.judged import SETTLED_BY, SPREAD, Judged, Kind, judge, kind_of
+from pyro_dynogp.discrepancy.judged import MORE, SPREAD, Judged, Kind, judge, kind_of
 from pyro_dynogp.discrepancy.search import Candidate, Found
 from pyro_dynogp.discrepancy.stretches import interleaved
 from pyro_dynogp.discrepancy.trials import Trial, Tried, run, with_substeps
@@ -176,8 +176,8 @@ class Refits:
             if np.isfinite(gain)
             else "could not be fitted to all known data"
         )
-        gained = one.attempt.reason.partition(SETTLED_BY)[0]  # no more samples are asked for
-        attempt = replace(one.attempt, reason=f"{gained}; {said}")
+        parts = [part for part in one.attempt.reason.split("; ") if not part.endswith(MORE)]
+        attempt = replace(one.attempt, reason="; ".join([*parts, said]))
         return replace(one, attempt=attempt, helps=helps)
 
     def evidence(self, one: Judged) -> float:

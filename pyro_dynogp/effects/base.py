@@ -168,6 +168,11 @@ def unit_of(evidence: Evidence) -> str:
     return f" {unit}" if unit else ""
 
 
+def driving_names(model: Model, prepared: Record) -> tuple[str, ...]:
+    """Inputs that act through dynamics, of a record that is prepared for the model."""
+    return prepared.input_names[: prepared.n_inputs - model.direct]
+
+
 def centre_of(record: Record, name: str) -> float:
     """Mean of a channel [its unit]."""
     return float(np.mean(signal_of(record, name)))

@@ -12,10 +12,18 @@ from pyro_dynogp.data.channels import ShiftedClock
 from pyro_dynogp.data.channels.clock import DAY
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.signals import shifted
-from pyro_dynogp.effects.base import Effect, changed, listed, number_of, set_last, unit_of
+from pyro_dynogp.effects.base import (
+    Effect,
+    changed,
+    driving_names,
+    listed,
+    number_of,
+    set_last,
+    unit_of,
+)
 from pyro_dynogp.effects.clock_shift_score import refined_shift, score_of_shifts, shifts_of
 from pyro_dynogp.effects.clocks import ZONES, all_zones, clock_shares, in_zone
-from pyro_dynogp.models.variants import Model, with_channel
+from pyro_dynogp.models.variants import Model, with_channel, with_channels
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
 from pyro_dynogp.statistics.pictures import about, evidence, in_words, instant, over_time
 from pyro_dynogp.statistics.prewhitening import prewhitened, spanning
@@ -185,10 +193,8 @@ class ClockShift(Effect):
         times: tuple[float, ...] = (number_of(evidence, "time"),)
         if "rule" in evidence.where:
             times = seasons(record, str(evidence.where["rule"]), str(evidence.where["season"]))
-        together = model
-        prepared = model.check(record)[0]
-        for name in prepared.input_names[: prepared.n_inputs - model.direct]:
-            together = with_channel(together, ShiftedClock(name, shift, times))
+        names = driving_names(model, model.check(record)[0])
+        together = with_channels(model, (ShiftedClock(name, shift, times) for name in names))
         alone = with_channel(model, ShiftedClock(channel, shift, times))
         return [alone] if together == alone else [alone, together]
 

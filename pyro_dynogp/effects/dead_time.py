@@ -15,6 +15,7 @@ from pyro_dynogp.effects.base import (
     FINER,
     Effect,
     changed,
+    driving_names,
     number_of,
     set_last,
     unit_of,
@@ -97,7 +98,7 @@ class DeadTime(Effect):
         grid = {float(d) for d in step * np.geomspace(1.0, longest, COARSE)}
         around = {share * more for share in AROUND}
         prepared = model.check(record)[0]
-        names = prepared.input_names[: prepared.n_inputs - model.direct]
+        names = driving_names(model, prepared)
         places: list[tuple[int, ...]] = [(k,) for k in range(len(names))]
         if len(names) > 1:
             places.append(tuple(range(len(names))))

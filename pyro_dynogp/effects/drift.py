@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 from collections.abc import Sequence
 from typing import ClassVar
@@ -11,8 +10,14 @@ import numpy as np
 
 from pyro_dynogp.data.channels import Ramp, RampOfGain, Trend, TrendOfGain
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.effects.base import Effect, centre_of
-from pyro_dynogp.models.variants import Model, with_channel, with_pairs, with_process_noise
+from pyro_dynogp.effects.base import Effect, centre_of, driving_names
+from pyro_dynogp.models.variants import (
+    Model,
+    with_channel,
+    with_channels,
+    with_pairs,
+    with_process_noise,
+)
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
 from pyro_dynogp.statistics.pictures import about, evidence, over_time
 from pyro_dynogp.statistics.prewhitening import free_columns, prewhitened, spanning
@@ -101,7 +106,7 @@ class Drift(Effect):
         drifting = [one for one in model.channels if isinstance(one, TrendOfGain)]
         made = {name for one in drifting for name in one.names}
         prepared = model.check(record)[0]
-        driving = prepared.input_names[: prepared.n_inputs - model.direct]
+        driving = driving_names(model, prepared)
         centres = {name: centre_of(prepared, name) for name in driving if name not in made}
         last = begin + LAST * (end - begin)
         ramps = list(itertools.pairwise(np.linspace(begin, last, RAMPS + 1).tolist()))
@@ -116,7 +121,7 @@ class Drift(Effect):
         # A gain that drifts already has what it has not had.
         kinds = {type(one) for one in model.channels}
         return [
-            functools.reduce(with_channel, channels, model)
+            with_channels(model, channels)
             for channels in variants
             if not kinds & {type(one) for one in channels}
         ]

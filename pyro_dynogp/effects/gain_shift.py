@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -10,14 +9,14 @@ import numpy as np
 
 from pyro_dynogp.data.channels import Channel, Ramp, RampOfGain, Step, StepOfGain
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.effects.base import Effect, centre_of, number_of, unit_of
-from pyro_dynogp.models.variants import Model, with_channel
+from pyro_dynogp.effects.base import Effect, centre_of, driving_names, number_of, unit_of
+from pyro_dynogp.models.variants import Model, with_channels
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
 from pyro_dynogp.statistics.pictures import about, evidence, instant, over_time
-from pyro_dynogp.statistics.prewhitening import Projection, prewhitened, spanning
+from pyro_dynogp.statistics.prewhitening import Projection, spanning
 from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.statistics.shares_of_inputs import contributions, paths
-from pyro_dynogp.statistics.steps import instants, stairs, steps
+from pyro_dynogp.statistics.steps import instants, step_scan
 from pyro_dynogp.support.errors import invalid
 
 # Of instants that are tried around one, by how much they are closer each time.
@@ -50,22 +49,12 @@ def gain_shift(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -
     names, signals = contributions(r)
     if not names:
         raise invalid("residuals", expected="a mean that moves", got="a constant one")
-    places = instants(len(r), settings.step_margin)
     nuisance = spanning(signals)
-    scan = prewhitened(
-        r.residual,
-        steps(signals, places),
-        nuisance,
-        r.deviations,
-        settings,
-        first=np.column_stack([stairs(signals), nuisance]),
-        seed=seed,
-    )
-    k, place = divmod(scan.best, len(places))
+    scan, k, at = step_scan(r, signals, nuisance, settings, seed)
     of = range(r.inputs.shape[1]) if k == 0 else [r.input_names.index(names[k])]
     under = Projection(scan.whitener, nuisance, ~np.isfinite(r.residual), settings)
     within = len(r) // 10 if scan.p_value < settings.noticed else 0
-    at, share, fitted = _nearby(r, of, under, places, int(places[place]), within)
+    at, share, fitted = _nearby(r, of, under, instants(len(r), settings.step_margin), at, within)
     way = "up" if share > 0 else "down"
     return evidence(
         "gain shift",
@@ -154,7 +143,7 @@ class GainShift(Effect):
         """
         at, channel = number_of(evidence, "time"), evidence.where["channel"]
         prepared = model.check(record)[0]
-        driving = prepared.input_names[: prepared.n_inputs - model.direct]
+        driving = driving_names(model, prepared)
         made = {n for one in model.channels if isinstance(one, SHIFTS) for n in one.names}
         of = [name for name in driving if name == channel] or [
             name for name in driving if name not in made
@@ -170,7 +159,7 @@ class GainShift(Effect):
             ends = (max(at - half, first), min(at + half, last))
             ramps = [RampOfGain(name, centre, *ends) for name, centre in centres.items()]
             variants.append([*ramps, Ramp(*ends)])
-        return [functools.reduce(with_channel, channels, model) for channels in variants]
+        return [with_channels(model, channels) for channels in variants]
 
     def sentence(self, evidence: Evidence, model: Model) -> str:
         """How long it takes, where it is no step."""

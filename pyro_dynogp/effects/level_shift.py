@@ -12,9 +12,9 @@ from pyro_dynogp.effects.base import Effect, number_of
 from pyro_dynogp.models.variants import Model, with_channel
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
 from pyro_dynogp.statistics.pictures import evidence, instant, over_time
-from pyro_dynogp.statistics.prewhitening import prewhitened, spanning
+from pyro_dynogp.statistics.prewhitening import spanning
 from pyro_dynogp.statistics.settings import LoopSettings
-from pyro_dynogp.statistics.steps import instants, stairs, steps
+from pyro_dynogp.statistics.steps import step_scan
 
 
 def level_shift(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) -> Evidence:
@@ -27,20 +27,9 @@ def level_shift(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) 
     whitened residual, as level shifts in Chen & Liu, JASA 88(421):284 (1993).
     """
     r = residuals
-    level = np.ones((len(r), 1))
-    places = instants(len(r), settings.step_margin)
     # No slow responses of the inputs here: they would claim a step at almost any instant.
     nuisance = spanning(np.column_stack([r.mean, r.inputs]))
-    scan = prewhitened(
-        r.residual,
-        steps(level, places),
-        nuisance,
-        r.deviations,
-        settings,
-        first=np.column_stack([stairs(level), nuisance]),
-        seed=seed,
-    )
-    at = int(places[scan.best])
+    scan, _, at = step_scan(r, np.ones((len(r), 1)), nuisance, settings, seed)
     size = float(scan.fitted[at] - scan.fitted[at - 1])
     way = "up" if size > 0 else "down"
     return evidence(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import functools
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 from pyro_dynogp.data.channels import Channel, count_direct
@@ -43,6 +44,11 @@ def with_channel(model: Model, channel: Channel) -> Model:
     )
 
 
+def with_channels(model: Model, channels: Iterable[Channel]) -> Model:
+    """The model with several channels more, each of which may build on those before it."""
+    return functools.reduce(with_channel, channels, model)
+
+
 def without_channel(model: Model, channel: Channel) -> Model:
     """The model without a channel that no other one builds on."""
     less = 0 if channel.replaces else len(channel.names)
@@ -76,12 +82,8 @@ def with_channels_of(model: Model, other: Model, base: Model) -> Model | None:
     """
     if model.channels != base.channels:
         return None
-    own = len(base.channels)
-    added, same = other.channels[own:], base
-    for channel in added:
-        same = with_channel(same, channel)
-        model = with_channel(model, channel)
-    return model if added and same == other else None
+    added = other.channels[len(base.channels) :]
+    return with_channels(model, added) if added and with_channels(base, added) == other else None
 
 
 def without_channels_of(model: Model, other: Model, base: Model) -> Model | None:

@@ -4,10 +4,53 @@ from __future__ import annotations
 
 import numpy as np
 
-from pyro_dynogp.statistics.prewhitening import Projection, Score, Scored, Variants, log_ratio
+from pyro_dynogp.statistics.bootstrap import Scan
+from pyro_dynogp.statistics.evidence import Residuals
+from pyro_dynogp.statistics.prewhitening import (
+    Projection,
+    Score,
+    Scored,
+    Variants,
+    log_ratio,
+    prewhitened,
+)
+from pyro_dynogp.statistics.settings import LoopSettings
 
 # Levels of a staircase that stands for any step while the first filter is fitted.
 LEVELS = 8
+
+
+def step_scan(
+    residuals: Residuals,
+    signals: np.ndarray,
+    nuisance: np.ndarray,
+    settings: LoopSettings,
+    seed: int,
+) -> tuple[Scan, int, int]:
+    """Test whether any of some signals (n, K) begins to act at any instant.
+
+    Args:
+        signals: finite; ones for the level. nuisance: (n, M) from `spanning`; no step may claim it.
+        seed: of the replicates.
+
+    Returns:
+        The scan; which signal steps, and at which sample, in the best variant.
+
+    Raises:
+        ValueError: where there are too few samples.
+    """
+    places = instants(len(residuals), settings.step_margin)
+    scan = prewhitened(
+        residuals.residual,
+        steps(signals, places),
+        nuisance,
+        residuals.deviations,
+        settings,
+        first=np.column_stack([stairs(signals), nuisance]),
+        seed=seed,
+    )
+    k, place = divmod(scan.best, len(places))
+    return scan, k, int(places[place])
 
 
 def instants(count: int, margin: float) -> np.ndarray:
@@ -65,12 +108,8 @@ def steps(signals: np.ndarray, places: np.ndarray) -> Variants:
             squares += (2.0 if k else 1.0) * G[:, None] * signals * later
         norm = from_there(squares)  # (M, K)
         spanned = pulses(under.Q, c)
-        left = np.stack(
-            [
-                norm[:, k] - np.square(from_there(spanned * signals[:, k, None])).sum(1)
-                for k in range(K)
-            ]
-        )
+        taken = [np.square(from_there(spanned * m[:, None])).sum(1) for m in signals.T]
+        left = norm.T - np.stack(taken)
         usable = left > 1e-6 * norm.T
 
         def score(x: np.ndarray) -> Scored:

@@ -240,12 +240,15 @@ def test_what_nearly_helps_is_settled_by_the_evidence_of_all_known_data(
     fit: Any = object()
     one = candidate(INPUT, gain, 10.0, q=q)
     one = replace(one, tried=replace(one.tried, fit=fit))
+    later = f"{one.attempt.reason}; on blocks of the whole record"
+    one = replace(one, attempt=replace(one.attempt, reason=later))
     judged = [one, *([candidate(DELAY, 30.0, 10.0)] if other else [])]
     first, *_ = refits(NOTHING).by_evidence(judged, 0.05)
     assert first.helps is helps
     if helps:
         assert first.attempt.reason.endswith("the evidence for it is +5.1 nats")
         assert "would settle it" not in first.attempt.reason
+        assert "nats; on blocks of the whole record; fitted to" in first.attempt.reason
     else:
         assert first is one
     unfitted = candidate(INPUT, 17.0, 10.0)

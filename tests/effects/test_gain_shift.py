@@ -24,6 +24,7 @@ def weaker(t, mean, u):
 
 class TestTest:
     def test_it_is_found_with_its_instant_and_size(self):
+        """In noise as large as what the gain changes by: within a few samples and a tenth."""
         found = [
             gain_shift(residuals(s, 500, pole=0.5, effect=weaker), SETTINGS, seed=s)
             for s in range(5)
@@ -46,6 +47,7 @@ class TestTest:
             time=0.1 * np.arange(500), step=0.1, deviations=1e-3 * r.deviations,
         )  # fmt: skip
         found = gain_shift(r, SETTINGS)
+        # One sample, of 0.1 s, and what noise of 0.02 makes of a ratio.
         assert found.where["time"] == pytest.approx(25.0, abs=0.11)
         assert found.where["ratio"] == pytest.approx(0.4, abs=0.03)
 
