@@ -54,10 +54,10 @@ def innovate_together(problem: FilterProblem) -> tuple[np.ndarray, np.ndarray, n
 
     found = np.concatenate(each(group, -(-count // WIDTH)))
     error, variance = found[:, 0], found[:, 1]
-    if gaussian:
-        density = -0.5 * (error**2 / variance + np.log(2.0 * np.pi * variance))
-    else:
-        with np.errstate(divide="ignore"):  # where there is no density
+    with np.errstate(divide="ignore", invalid="ignore"):  # where there is no density
+        if gaussian:
+            density = -0.5 * (error**2 / variance + np.log(2.0 * np.pi * variance))
+        else:
             density = found[:, 2] + np.log(found[:, 3]) - 0.5 * np.log(2.0 * np.pi)
     shape = (*batch, *y.shape)
     return error.reshape(shape), variance.reshape(shape), density.reshape(shape)

@@ -1,5 +1,6 @@
 """The filter in lanes against the filter of one point."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -110,6 +111,18 @@ def test_outliers_far_beyond_what_exponentials_hold():
     assert np.isfinite(density[:, ~y.isnan().any(1)]).all()
     # Exponentials have another last bit, as above.
     np.testing.assert_allclose(density, one_by_one(problems)[2], rtol=1e-11)
+
+
+def test_a_variance_below_zero_is_no_density_and_no_warning():
+    problems = points("one table", 4)
+    problems[1] = replace(problems[1], R=-1e3 * problems[1].R)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        _, variance, density = innovate_together(together(problems))
+    assert np.nanmin(variance[1]) < 0.0
+    assert np.isnan(density[1][variance[1] < 0.0]).all()
+    there = ~torch.isnan(problems[0].y).numpy()
+    assert np.isfinite(density[0][there]).all()
 
 
 def test_a_point_without_a_density_leaves_the_others_alone():
