@@ -69,12 +69,13 @@ def whole(least: int, most: float = math.inf) -> Rule:
     return Rule(f"a whole number {to}", plain)
 
 
-def between(low: float, high: float, expected: str) -> Rule:
-    """A real number within open bounds; not NaN, True or False."""
+def between(low: float, high: float, expected: str, *, with_low: bool = False) -> Rule:
+    """A real number within open bounds, or `with_low` the lower one; not NaN, True or False."""
 
     def plain(value: object) -> float | None:
         number = isinstance(value, Real) and not isinstance(value, bool)
-        return float(value) if number and low < value < high else None  # type: ignore
+        inside = number and (low < value < high or (with_low and value == low))  # type: ignore
+        return float(value) if inside else None  # type: ignore
 
     return Rule(expected, plain)
 
@@ -118,7 +119,7 @@ SWITCH = Rule(
 PATH = Rule("a path", lambda value: value if isinstance(value, str | os.PathLike) else None)
 COUNT, NUMBER = whole(1), whole(0)
 POSITIVE = between(0.0, math.inf, "a finite number > 0")
-POSITIVE_OR_ZERO = between(-5e-324, math.inf, "a finite number >= 0")
+POSITIVE_OR_ZERO = between(0.0, math.inf, "a finite number >= 0", with_low=True)
 SHARE = between(0.0, 1.0, "a number between 0 and 1")
 # What an argument of each name has to be, wherever it is one; None is none given where that is the
 # default.
@@ -132,6 +133,7 @@ RULES = {
                      "pathwise", "scaled"), SWITCH),
     "seed": Rule("a whole number from 0 to 2**63 - 1", whole(0, 2**63 - 1).plain),
     "level": SHARE,
+    "least_lengthscale": POSITIVE_OR_ZERO,
     **dict.fromkeys(("learning_rate", "init_scale", "joint_scale", "gain_scale", "step", "duration",
                      "degrees_of_freedom", "time_limit"), POSITIVE),
     **dict.fromkeys(("path", "checkpoint"), PATH),

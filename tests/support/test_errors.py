@@ -2,7 +2,8 @@
 
 import pytest
 
-from pyro_dynogp.support.errors import warn
+from pyro_dynogp.inference.density import denormals_flushed
+from pyro_dynogp.support.errors import POSITIVE_OR_ZERO, warn
 
 
 def module(name, code, **names):
@@ -21,3 +22,10 @@ def test_warnings_are_of_the_line_that_called_through_other_libraries():
     with pytest.warns(UserWarning, match="careful") as caught:
         outer["fit"]()
     assert [one.filename for one in caught] == [__file__]
+
+
+def test_zero_is_no_negative_number_where_small_numbers_are_flushed():
+    with denormals_flushed():
+        assert POSITIVE_OR_ZERO.plain(0.0) == 0.0
+        assert POSITIVE_OR_ZERO.plain(-1e-300) is None
+        assert POSITIVE_OR_ZERO.plain(float("inf")) is None
