@@ -70,6 +70,17 @@ def free_run_error(
     return total if np.isfinite(total) else np.inf
 
 
+def noise_sites(model: Model) -> tuple[str, ...]:
+    """Sites of the process noise of layers that something drives, as far as a model has any."""
+    return tuple(
+        f"{wire.name}_{part}"
+        for wire, layer in model.dynamic
+        if layer.process_noise and wire.channels + wire.fed
+        for part in ("noise_gain_local_scale", "noise_gain_unit")
+        + ("integrator_noise",) * layer.integrators
+    )
+
+
 def silenced(
     model: Model,
     records: Sequence[PreparedRecord],
@@ -82,8 +93,7 @@ def silenced(
         model: with process noise, collapsed. records: of it. optimum: without.
         start: values of all sites of the model.
     """
-    driven = [w.name for w, _ in model.dynamic if w.channels + w.fed]
-    off = {f"{name}_{of}" for name in driven for of in ("noise_gain_unit", "integrator_noise")}
+    off = [site for site in noise_sites(model) if not site.endswith("_local_scale")]
     values = grown(optimum.values, dict(start))
     values = {k: SILENT * v if k in off else v for k, v in values.items()}
     potential = Potential(model, (records,), values)

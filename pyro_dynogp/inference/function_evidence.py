@@ -29,10 +29,12 @@ from torch import Tensor
 
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.free_runs import free_run_error, noise_sites
 from pyro_dynogp.inference.optimise.gauss_newton import Innovations, has_innovations
 from pyro_dynogp.inference.optimise.maximum import Effort, maximise, optimizer_near
 from pyro_dynogp.inference.optimise.optimum import Optimum
 from pyro_dynogp.inference.run import Run
+from pyro_dynogp.inference.starts.dynamic import Values
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.models.wiring import Static, Wire
@@ -46,6 +48,8 @@ SEARCH_STEPS = 60
 # Optima of which the evidence chooses. One that lags by so many nats after a round is left: later
 # rounds gain up to 10.
 CONSIDERED, BEHIND = 2, 10.0
+# With feedback, most that a round may make the error of free runs larger.
+WORSE = 1.25
 
 
 def functions_of(model: Model) -> list[tuple[Wire, Static]]:
@@ -111,14 +115,24 @@ def with_kernels_by_evidence(
     here = _Expansion.at(model, records, optimum.values)
     if not np.isfinite(here.energy):
         return optimum, np.inf
+    noise = noise_sites(model) if model.has_feedback else ()
+    error = free_run_error(model, optimum.values, records) if noise else np.inf
+
+    def climbed(values: Values, held: tuple[str, ...], key: str) -> Optimum:
+        return maximise(
+            model, records, [values], run, optimizer=optimizer, steps=STEPS, key=key,
+            effort=Effort(near=True), held=held,
+        )[0]  # fmt: skip
+
     for number in range(rounds):
         values, gain = here.best()
         if not gain >= SETTLED or (number and here.energy > enough + BEHIND):
             break
-        found = maximise(
-            model, records, [values], run, optimizer=optimizer, steps=STEPS,
-            key=f"{key}-{number}", effort=Effort(near=True), held=names,
-        )[0]  # fmt: skip
+        found = climbed(values, names, f"{key}-{number}")
+        if noise and not free_run_error(model, found.values, records) <= WORSE * error:
+            found = climbed(values, (*names, *noise), f"{key}-{number}-noise-held")
+            if not free_run_error(model, found.values, records) <= WORSE * error:
+                break
         there = _Expansion.at(model, records, found.values)
         if not there.energy < here.energy:
             break

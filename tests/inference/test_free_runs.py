@@ -9,7 +9,7 @@ import torch
 
 import pyro_dynogp as dgp
 from pyro_dynogp.inference import free_runs
-from pyro_dynogp.inference.free_runs import free_run_error, noise_pays
+from pyro_dynogp.inference.free_runs import free_run_error, noise_pays, noise_sites
 from pyro_dynogp.inference.methods import mode
 from pyro_dynogp.inference.optimise.optimum import Optimum
 from pyro_dynogp.inference.run import Run
@@ -168,3 +168,23 @@ def test_process_noise_begins_faint_after_climbs_without_any(monkeypatch):
     assert torch.equal(learnt[scale], starts[0][scale])  # what is learnt stays
     assert torch.allclose(noisy[scale], FAINT * starts[0][scale])
     assert torch.equal(noisy["f_values"], quiet[0]["f_values"])
+
+
+@pytest.mark.parametrize(
+    ("model", "parts"),
+    [
+        (dgp.NonlinearFeedback(1), ("noise_gain_local_scale", "noise_gain_unit")),
+        (dgp.NonlinearFeedback(1, process_noise=False), ()),
+        (
+            dgp.LinearDynamicGP(1, integrators=1),
+            ("noise_gain_local_scale", "noise_gain_unit", "integrator_noise"),
+        ),
+    ],
+)
+def test_noise_sites_are_those_of_the_model(model, parts):
+    scaling = model.scaled_to(dgp.datasets.load("gas_furnace").train).scaling
+    names = [site.name for site in model.sites(scaling)]
+    assert noise_sites(model) == tuple(f"g_{part}" for part in parts)
+    assert set(noise_sites(model)) == {
+        n for n in names if n.endswith("_noise") or "_noise_gain" in n
+    }

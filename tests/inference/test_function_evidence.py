@@ -369,3 +369,48 @@ def test_steep_likelihoods_have_an_evidence_too():
     assert np.isfinite(gain)
     assert gain >= 0.0
     assert all(bool(torch.isfinite(value).all()) for value in values.values())
+
+
+class TestFreeRunsWithKernelsByEvidence:
+    """Process noise that a climb of kernels lets in must not be paid for by free runs."""
+
+    def found(self, monkeypatch, *errors):
+        """The optimum and its evidence where the free runs of each climb have these errors."""
+        problem, start = begun(MODELS["one function"])
+        given = Optimum(values=start, energy=0.0, history=np.zeros(1), message="given")
+        told = iter([1.0, *errors])
+        monkeypatch.setattr(function_evidence, "free_run_error", lambda *_: next(told))
+        one, _ = with_kernels_by_evidence(
+            problem.target, problem.records, given, ALONE, "kernels", rounds=1
+        )
+        assert next(told, None) is None
+        return start, one.values
+
+    def moved(self, start, values, part):
+        return not torch.equal(start[f"g_noise_gain_{part}"], values[f"g_noise_gain_{part}"])
+
+    def test_a_climb_with_free_runs_as_good_is_taken(self, monkeypatch):
+        start, values = self.found(monkeypatch, 1.24)
+        assert self.moved(start, values, "unit")
+        assert self.moved(start, values, "local_scale")
+
+    def test_noise_is_held_where_they_are_worse(self, monkeypatch):
+        start, values = self.found(monkeypatch, 1.26, 1.0)
+        assert not torch.equal(start["f_lengthscale"], values["f_lengthscale"])
+        assert not torch.equal(start["f_values"], values["f_values"])
+        assert not self.moved(start, values, "unit")
+        assert not self.moved(start, values, "local_scale")
+
+    @pytest.mark.parametrize("again", [1.26, np.inf, np.nan])
+    def test_nothing_is_taken_where_they_stay_worse(self, monkeypatch, again):
+        start, values = self.found(monkeypatch, np.nan, again)
+        assert values is start
+
+    def test_forward_cascades_are_not_asked(self, monkeypatch):
+        problem, start = begun(MODELS["at the output"])
+        given = Optimum(values=start, energy=0.0, history=np.zeros(1), message="given")
+        monkeypatch.setattr(function_evidence, "free_run_error", None)
+        one, _ = with_kernels_by_evidence(
+            problem.target, problem.records, given, ALONE, "kernels", rounds=1
+        )
+        assert one.values is not start
