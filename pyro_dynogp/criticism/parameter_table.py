@@ -86,10 +86,11 @@ def _rows(fit: Fitted) -> Iterator[Row]:
 
 def _lengthscales(fit: Fitted, wire: Wire) -> Iterator[Row]:
     """Of the default kernel, one for each channel that the function sees."""
-    draws = fit.draws.get(f"{wire.name}_lengthscale")
+    scaling = fit.scaling
+    assert isinstance(wire.layer, Static)
+    draws = fit.model.static_prior(wire, wire.layer, scaling).lengthscale(fit.draws)
     if draws is None:
         return
-    scaling = fit.scaling
     seen: list[tuple[str, float, str]] = []
     for source in wire.sources:
         own = next((w for w in fit.model.wires if w.name == source), None)

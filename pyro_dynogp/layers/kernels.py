@@ -29,6 +29,9 @@ from pyro_dynogp.support.tensors import broadcast
 # Smoothness by default, and of functions in feedback: a rough one is uncertain between its inducing
 # values, and free runs draw from that again and again.
 ROUGH, SMOOTH = 1.5, 2.5
+# Least lengthscale of functions in feedback, in distances between inducing locations. Filters read
+# between these, free runs draw what they leave open: of shorter lengthscales nearly everything.
+RESOLVED = 2.0
 MATERN = {0.5: "matern12", 1.5: "matern32", 2.5: "matern52"}
 # Kernels whose GPyTorch code takes parameters with more leading dimensions than they were made
 # with; of all others one batch element is evaluated at a time.

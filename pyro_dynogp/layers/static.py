@@ -76,6 +76,7 @@ class StaticPrior:
             `starting_locations`.
         order: places of the channels as the sequence of starting locations takes them; None as
             they are given.
+        least_lengthscale: l0, of the default kernel on an even grid, in distances of locations.
 
     Raises:
         ValueError: if an option or shape is wrong.
@@ -91,6 +92,7 @@ class StaticPrior:
     locations: Any = None
     smoothness: float = ROUGH
     order: tuple[int, ...] | None = None
+    least_lengthscale: float = 0.0
 
     def __post_init__(self) -> None:
         verify_fields(self)
@@ -148,6 +150,14 @@ class StaticPrior:
         sites.append(normal(f"{name}_values", values, (outputs, inducing), role="free"))
         return tuple(sites)
 
+    def lengthscale(self, values: Values) -> Tensor | None:
+        """sqrt(l^2 + (l0 h)^2) (*b, d), l of the site and h between locations; None of a kernel."""
+        own = values.get(f"{self.name}_lengthscale") if self.kernel is None else None
+        if own is None or not self._even or not self.least_lengthscale:
+            return own
+        h = 2.0 * values[f"{self.name}_half_width"] / max(self.inducing - 1, 1)
+        return torch.hypot(own, self.least_lengthscale * h)
+
     def function(self, values: Values) -> StaticFunction:
         """The function at values (*b, *shape) of the sites; batch shape *b."""
         name, Z = self.name, self.start
@@ -156,6 +166,9 @@ class StaticPrior:
             Z = center.unsqueeze(-2) + half_width.unsqueeze(-2) * (Z / REACH)
         elif self.learn_locations:
             Z = values[f"{name}_locations"]
+        lengthscale = self.lengthscale(values)
+        if lengthscale is not None:
+            values = {**values, f"{name}_lengthscale": lengthscale}
         return StaticFunction(
             self.kernel_prior.sampled(values),
             Z,

@@ -94,6 +94,8 @@ class Static:
         outputs: width of the layer. inducing: number of inducing values for each output.
         kernel: a gpytorch kernel; by default Matern with a lengthscale for each channel.
         smoothness: nu of the default kernel, 0.5, 1.5 or 2.5.
+        least_lengthscale: of the default kernel of a function of one signal, in distances between
+            inducing locations, which do not tell what varies between them; 0 for none.
         mean: "linear" or "constant" prior mean; by default linear for a first layer, in feedback
             from several signals and where there are limits, else constant. Beyond the data a
             function goes back to it; in feedback from one signal it keeps its value, so that what
@@ -123,6 +125,7 @@ class Static:
     support: int = 64
     name: str | None = None
     smoothness: float = ROUGH
+    least_lengthscale: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -237,6 +237,7 @@ class Model(Structure):
             learn_locations=layer.learn_locations,
             smoothness=layer.smoothness,
             order=self.order_of(place, scaling or self.scaling),
+            least_lengthscale=layer.least_lengthscale,
         )
 
     def _has_residual(self, place: Wire) -> bool:

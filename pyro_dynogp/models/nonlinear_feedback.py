@@ -6,7 +6,7 @@ from typing import Unpack
 
 from gpytorch.kernels import Kernel
 
-from pyro_dynogp.layers.kernels import ROUGH, SMOOTH
+from pyro_dynogp.layers.kernels import RESOLVED, ROUGH, SMOOTH
 from pyro_dynogp.layers.noise import Gaussian, Likelihood
 from pyro_dynogp.models.arrival import free_delays
 from pyro_dynogp.models.model import Model
@@ -47,7 +47,8 @@ def NonlinearFeedback(
             as well; by default with one hidden signal.
         substeps: equal parts of each interval between samples in which the functions are computed
             anew; by default 3 with a `Step`, 1 without and beside dead times that are parameters.
-        kernel: of the functions, a gpytorch kernel; Matern-5/2 by default.
+        kernel: of the functions, a gpytorch kernel; by default Matern-5/2 with a lengthscale of at
+            least twice the distance between inducing locations.
 
     Examples:
         >>> model = dgp.NonlinearFeedback(1, pairs=1)
@@ -71,7 +72,7 @@ def NonlinearFeedback(
     if substeps is None:
         late = bool(free_delays(options.get("channels", ())))
         substeps = usual_substeps(steps=step, late=late)
-    smoothness = SMOOTH if kernel is None else ROUGH
+    smoothness, least = (SMOOTH, RESOLVED) if kernel is None else (ROUGH, 0.0)
     layers: list[Layer] = [
         Dynamic(
             outputs=outputs,
@@ -81,13 +82,19 @@ def NonlinearFeedback(
             hidden=hidden,
             substeps=substeps,
         ),
-        Static(outputs=outputs, inducing=inducing, kernel=kernel, smoothness=smoothness),
+        Static(
+            outputs=outputs,
+            inducing=inducing,
+            kernel=kernel,
+            smoothness=smoothness,
+            least_lengthscale=least,
+        ),
     ]
     if hidden:
         layers.append(
             Static(
                 outputs=hidden, inducing=inducing, kernel=kernel, sees=("g_hidden",),
-                smoothness=smoothness,
+                smoothness=smoothness, least_lengthscale=least,
             )
         )  # fmt: skip
     if step:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 from pyro_dynogp.data.channels import Channel, count_direct
-from pyro_dynogp.layers.kernels import SMOOTH
+from pyro_dynogp.layers.kernels import RESOLVED, SMOOTH
 from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.product import Product, factors, is_product
@@ -190,7 +190,10 @@ def with_input_function(model: Model) -> Model | None:
 
 def _smooth(name: str, sees: tuple[str, ...], outputs: int) -> Static:
     """A function in feedback."""
-    return Static(outputs, inducing=INDUCING, name=name, sees=sees, smoothness=SMOOTH)
+    return Static(
+        outputs, inducing=INDUCING, name=name, sees=sees, smoothness=SMOOTH,
+        least_lengthscale=RESOLVED,
+    )  # fmt: skip
 
 
 def with_feedback(model: Model, *, output: bool = True, hidden: bool = False) -> Model | None:

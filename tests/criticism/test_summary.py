@@ -76,7 +76,9 @@ class TestTable:
         model = dgp.NonlinearFeedback(1, inducing=5)
         looped = dgp.fit(model, record, method="map", steps=3, **QUICK)
         row = looped.summary().table.loc["f: lengthscale along y"]
-        expected = float(looped.draws["f_lengthscale"]) * looped.scaling.output_scale[0]
+        apart = 2.0 * float(looped.draws["f_half_width"]) / 4
+        length = np.hypot(float(looped.draws["f_lengthscale"]), 2.0 * apart)
+        expected = length * looped.scaling.output_scale[0]
         assert (row["mean"], row["unit"]) == (pytest.approx(expected), "m")
 
     def test_integrators_have_rates(self, record):

@@ -1,7 +1,9 @@
 """Static layers as sample sites of Pyro models."""
 
 import math
+from typing import Any
 
+import gpytorch
 import numpy as np
 import pyro
 import pyro.distributions as dist
@@ -10,8 +12,16 @@ import torch
 from pyro.infer import SVI, Predictive, TraceMeanField_ELBO
 from pyro.infer.autoguide import AutoNormal
 
+import pyro_dynogp as dgp
 from pyro_dynogp.layers.functions import JITTER
-from pyro_dynogp.layers.static import sample_static, starting_locations, static_gp
+from pyro_dynogp.layers.kernels import RESOLVED, SMOOTH
+from pyro_dynogp.layers.static import (
+    StaticPrior,
+    sample_static,
+    starting_locations,
+    static_gp,
+)
+from pyro_dynogp.models.variants import with_feedback
 from tests.layers.dense import Dense, close, draw, normal, values
 
 SITES = (
@@ -313,3 +323,66 @@ class TestErrors:
     def test_inputs(self, x, message):
         with pytest.raises(ValueError, match=message):
             static_gp("f", x)
+
+
+ONE_CHANNEL: Any = {"channels": 1, "outputs": 1, "inducing": 9, "smoothness": SMOOTH}
+
+
+class TestLeastLengthscale:
+    """Inducing values do not tell what varies between their locations."""
+
+    def values(self, lengthscale, prior):
+        found = {site.name: site.typical() for site in prior.sites()}
+        one = torch.ones(1, dtype=torch.float64)
+        return {**found, "f_lengthscale": lengthscale * one, "f_half_width": 4.0 * one}
+
+    @pytest.mark.parametrize("lengthscale", [1e-6, 0.3, 5.0])
+    def test_root_of_squares_with_the_distance_of_locations(self, lengthscale):
+        prior = StaticPrior("f", least_lengthscale=1.7, **ONE_CHANNEL)
+        function = prior.function(self.values(lengthscale, prior))
+        expected = math.sqrt(lengthscale**2 + 1.7**2)  # locations are one apart
+        assert function.kernel.radial is not None
+        assert float(function.kernel.radial[1]) == pytest.approx(expected, rel=1e-12)
+        x = 0.25 + torch.arange(-4.0, 4.0, dtype=torch.float64).unsqueeze(-1)
+        other = StaticPrior("f", **ONE_CHANNEL)
+        same = other.function(self.values(expected, other))
+        close(function.mean(x), same.mean(x), 1e-12)
+
+    @pytest.mark.parametrize("at", [0.0, 0.1, 0.25, 0.5])
+    def test_little_is_left_open_between_locations(self, at):
+        """Of a scale of one: 8 % at most however short the site's lengthscale is."""
+        prior = StaticPrior("f", least_lengthscale=RESOLVED, **ONE_CHANNEL)
+        x = torch.tensor([[at], [2.0 + at]], dtype=torch.float64)
+        left = prior.function(self.values(1e-6, prior)).moments(x)[1]
+        assert float(left.max()) < 0.08**2
+        free = StaticPrior("f", **ONE_CHANNEL)
+        if at == 0.5:
+            assert float(free.function(self.values(0.1, free)).moments(x)[1].min()) > 0.99
+
+    @pytest.mark.parametrize(
+        "options",
+        [{"least_lengthscale": 0.0}, {"locations": np.arange(9.0)}, {"learn_locations": False}],
+    )
+    def test_other_grids_have_none(self, options):
+        prior = StaticPrior("f", **{"least_lengthscale": 2.0, **ONE_CHANNEL, **options})
+        assert float(prior.lengthscale(self.values(0.1, prior))) == 0.1
+
+    def test_another_kernel_has_none(self):
+        kernel = gpytorch.kernels.MaternKernel(2.5)
+        prior = StaticPrior("f", 1, 1, kernel=kernel, least_lengthscale=2.0)
+        assert prior.lengthscale({site.name: site.typical() for site in prior.sites()}) is None
+
+    def test_functions_in_feedback_have_one(self):
+        kernel = gpytorch.kernels.MaternKernel(2.5)
+        loop = with_feedback(dgp.LinearDynamicGP(1), hidden=True)
+        for model, least in (
+            (dgp.NonlinearFeedback(1, hidden=1), RESOLVED),
+            (dgp.NonlinearFeedback(1, hidden=1, kernel=kernel), 0.0),
+            (loop, RESOLVED),
+            (dgp.Wiener(1), 0.0),
+        ):
+            functions = [x for x in model.layers if isinstance(x, dgp.Static)]
+            assert {x.least_lengthscale for x in functions} == {least}
+            wire = next(w for w in model.wires if isinstance(w.layer, dgp.Static))
+            scaled = model.scaled_to(dgp.datasets.load("gas_furnace").train)
+            assert scaled.static_prior(wire, wire.layer).least_lengthscale == least

@@ -238,7 +238,8 @@ TABLE: dict[str, Entry] = {
         "outputs": COUNT, "inducing": COUNT, "kernel": KERNEL, "mean": NAME,
         "limits": ((1.0, 0.0), (None, None), (0.0,), 3, "ab", (np.nan, 1.0)),
         "skip": (("x",), 3), "sees": (("x",), 3), "learn_locations": SWITCH,
-        "support": COUNT, "name": ("y", 3), "smoothness": (1, 2.0, None, "rbf", np.nan, [1.5])}),
+        "support": COUNT, "name": ("y", 3), "smoothness": (1, 2.0, None, "rbf", np.nan, [1.5]),
+        "least_lengthscale": (-0.1, np.nan, np.inf, "2", [1.0])}),
     "Known": plain(of_model(dgp.Known, function=torch.sqrt), {
         "function": (3, None, "text"), "parameters": (3, {"a": 3}, {3: None}), "outputs": COUNT,
         "range": ((1.0, 0.0), 3, "text", (0.0, np.nan)), "scaled": SWITCH, "skip": (("x",), 3),
