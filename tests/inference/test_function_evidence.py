@@ -387,7 +387,9 @@ class TestFreeRunsWithKernelsByEvidence:
         return start, one.values
 
     def moved(self, start, values, part):
-        return not torch.equal(start[f"g_noise_gain_{part}"], values[f"g_noise_gain_{part}"])
+        """But for rounding: a pair's phase, which nothing depends on, is put in its place."""
+        before, after = (x[f"g_noise_gain_{part}"] for x in (start, values))
+        return float((after - before).abs().max()) > 1e-12
 
     def test_a_climb_with_free_runs_as_good_is_taken(self, monkeypatch):
         start, values = self.found(monkeypatch, 1.24)
