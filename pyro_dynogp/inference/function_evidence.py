@@ -48,7 +48,8 @@ SEARCH_STEPS = 60
 # Optima of which the evidence chooses. One that lags by so many nats after a round is left: later
 # rounds gain up to 10.
 CONSIDERED, BEHIND = 2, 10.0
-# With feedback, most that a round may make the error of free runs larger.
+# With feedback, most that a round may make the error of free runs larger: rounds of eight simulated
+# plants made it larger by 10 % at most, one that let process noise in by a factor of four.
 WORSE = 1.25
 
 

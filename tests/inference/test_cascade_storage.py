@@ -17,6 +17,7 @@ from pyro_dynogp.fitting import Fit
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.storage import FORMAT
+from pyro_dynogp.inference.stored_layers import layer_of, plain_layer
 from pyro_dynogp.support.checkpoints import write_tensors
 from tests.inference.cascades import FAST, wiener_record
 
@@ -223,3 +224,12 @@ def test_damaged_layers_are_refused(change, message, tmp_path, bent):
     rewrite(tmp_path / "fit", header)
     with pytest.raises(ValueError, match=message):
         dgp.load(tmp_path / "fit")
+
+
+def test_a_least_lengthscale_is_kept_and_files_without_one_have_none():
+    layer = dgp.NonlinearFeedback(1).layers[1]
+    options = plain_layer(layer)
+    assert options is not None
+    assert layer_of(options) == layer
+    assert options.pop("least_lengthscale") == 2.0
+    assert layer_of(options) == replace(layer, least_lengthscale=0.0)
