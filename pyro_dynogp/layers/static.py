@@ -167,10 +167,9 @@ class StaticPrior:
         elif self.learn_locations:
             Z = values[f"{name}_locations"]
         lengthscale = self.lengthscale(values)
-        if lengthscale is not None:
-            values = {**values, f"{name}_lengthscale": lengthscale}
+        own = values if lengthscale is None else {f"{name}_lengthscale": lengthscale}
         return StaticFunction(
-            self.kernel_prior.sampled(values),
+            self.kernel_prior.sampled(own),
             Z,
             values[f"{name}_values"],
             values[f"{name}_output_scale"],

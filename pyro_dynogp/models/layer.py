@@ -11,7 +11,7 @@ import torch
 from gpytorch.kernels import Kernel
 from torch import Tensor
 
-from pyro_dynogp.layers.kernels import ROUGH
+from pyro_dynogp.layers.kernels import RESOLVED, ROUGH, SMOOTH
 from pyro_dynogp.lti.modes import NoiseStructure
 from pyro_dynogp.support.errors import invalid
 
@@ -126,6 +126,22 @@ class Static:
     name: str | None = None
     smoothness: float = ROUGH
     least_lengthscale: float = 0.0
+
+
+def fed_back(
+    outputs: int,
+    *,
+    inducing: int = 32,
+    kernel: Kernel | None = None,
+    sees: tuple[str, ...] = (),
+    name: str | None = None,
+) -> Static:
+    """A function in feedback; smooth, and no finer than its inducing values, by default."""
+    smoothness, least = (SMOOTH, RESOLVED) if kernel is None else (ROUGH, 0.0)
+    return Static(
+        outputs, inducing=inducing, kernel=kernel, sees=sees, name=name, smoothness=smoothness,
+        least_lengthscale=least,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,13 @@ from typing import Unpack
 
 from gpytorch.kernels import Kernel
 
-from pyro_dynogp.layers.kernels import RESOLVED, ROUGH, SMOOTH
 from pyro_dynogp.layers.noise import Gaussian, Likelihood
 from pyro_dynogp.models.arrival import free_delays
+from pyro_dynogp.models.layer import fed_back
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.step import Step, usual_substeps
 from pyro_dynogp.models.structure import ModelOptions
-from pyro_dynogp.models.wiring import Dynamic, Layer, Static
+from pyro_dynogp.models.wiring import Dynamic, Layer
 from pyro_dynogp.support.errors import SWITCH, invalid, verify
 
 
@@ -72,7 +72,6 @@ def NonlinearFeedback(
     if substeps is None:
         late = bool(free_delays(options.get("channels", ())))
         substeps = usual_substeps(steps=step, late=late)
-    smoothness, least = (SMOOTH, RESOLVED) if kernel is None else (ROUGH, 0.0)
     layers: list[Layer] = [
         Dynamic(
             outputs=outputs,
@@ -82,21 +81,10 @@ def NonlinearFeedback(
             hidden=hidden,
             substeps=substeps,
         ),
-        Static(
-            outputs=outputs,
-            inducing=inducing,
-            kernel=kernel,
-            smoothness=smoothness,
-            least_lengthscale=least,
-        ),
+        fed_back(outputs, inducing=inducing, kernel=kernel),
     ]
     if hidden:
-        layers.append(
-            Static(
-                outputs=hidden, inducing=inducing, kernel=kernel, sees=("g_hidden",),
-                smoothness=smoothness, least_lengthscale=least,
-            )
-        )  # fmt: skip
+        layers.append(fed_back(hidden, inducing=inducing, kernel=kernel, sees=("g_hidden",)))
     if step:
         layers.append(Step(sees=("g_hidden" if hidden else "g",), name="step"))
     looped: ModelOptions = {"integrate": "all", "output": "g", **options}

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 from pyro_dynogp.data.channels import Channel, count_direct
-from pyro_dynogp.layers.kernels import RESOLVED, SMOOTH
 from pyro_dynogp.layers.noise import Likelihood
+from pyro_dynogp.models.layer import fed_back
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.product import Product, factors, is_product
 from pyro_dynogp.models.step import Step, is_step, usual_substeps
@@ -188,14 +188,6 @@ def with_input_function(model: Model) -> Model | None:
     return replace(model, layers=(first, *model.layers), scaling=None, output=None)
 
 
-def _smooth(name: str, sees: tuple[str, ...], outputs: int) -> Static:
-    """A function in feedback."""
-    return Static(
-        outputs, inducing=INDUCING, name=name, sees=sees, smoothness=SMOOTH,
-        least_lengthscale=RESOLVED,
-    )  # fmt: skip
-
-
 def with_feedback(model: Model, *, output: bool = True, hidden: bool = False) -> Model | None:
     """The model with static layers that see its last dynamic layer and act back on it.
 
@@ -213,9 +205,10 @@ def with_feedback(model: Model, *, output: bool = True, hidden: bool = False) ->
     own, unseen = (seen.name,), (seen.name + HIDDEN,)
     back: list[Static | Known] = []
     if output:
-        back.append(_smooth(FEEDBACK, own, layer.outputs))
+        back.append(fed_back(layer.outputs, inducing=INDUCING, sees=own, name=FEEDBACK))
     if hidden:
-        back += [_smooth(HIDDEN_FEEDBACK, unseen, 1), Step(sees=unseen, name=STEP)]
+        function = fed_back(1, inducing=INDUCING, sees=unseen, name=HIDDEN_FEEDBACK)
+        back += [function, Step(sees=unseen, name=STEP)]
     return _fed_back(model, back, hidden=hidden)
 
 

@@ -72,10 +72,10 @@ def whole(least: int, most: float = math.inf) -> Rule:
 def between(low: float, high: float, expected: str, *, with_low: bool = False) -> Rule:
     """A real number within open bounds, or `with_low` the lower one; not NaN, True or False."""
 
-    def plain(value: object) -> float | None:
+    def plain(value: Any) -> float | None:
         number = isinstance(value, Real) and not isinstance(value, bool)
-        inside = number and (low < value < high or (with_low and value == low))  # type: ignore
-        return float(value) if inside else None  # type: ignore
+        inside = number and (low < value < high or (with_low and value == low))
+        return float(value) if inside else None
 
     return Rule(expected, plain)
 

@@ -342,7 +342,7 @@ class TestLeastLengthscale:
         function = prior.function(self.values(lengthscale, prior))
         expected = math.sqrt(lengthscale**2 + 1.7**2)  # locations are one apart
         assert function.kernel.radial is not None
-        assert float(function.kernel.radial[1]) == pytest.approx(expected, rel=1e-12)
+        assert float(function.kernel.radial[1]) == pytest.approx(expected, rel=1e-12)  # rounding
         x = 0.25 + torch.arange(-4.0, 4.0, dtype=torch.float64).unsqueeze(-1)
         other = StaticPrior("f", **ONE_CHANNEL)
         same = other.function(self.values(expected, other))

@@ -117,7 +117,7 @@ def test_a_variance_below_zero_is_no_density_and_no_warning():
     problems = points("one table", 4)
     problems[1] = replace(problems[1], R=-1e3 * problems[1].R)
     with warnings.catch_warnings():
-        warnings.simplefilter("error")
+        warnings.simplefilter("error")  # none may come
         _, variance, density = innovate_together(together(problems))
     assert np.nanmin(variance[1]) < 0.0
     assert np.isnan(density[1][variance[1] < 0.0]).all()
