@@ -61,6 +61,7 @@ if TYPE_CHECKING:  # the same names, for editors and type checkers; a test compa
     )
     from pyro_dynogp.models.architectures import Wiener as Wiener
     from pyro_dynogp.models.architectures import WienerHammerstein as WienerHammerstein
+    from pyro_dynogp.models.forms import Form as Form
     from pyro_dynogp.models.layer import Dynamic as Dynamic
     from pyro_dynogp.models.layer import Known as Known
     from pyro_dynogp.models.layer import Static as Static
@@ -68,7 +69,6 @@ if TYPE_CHECKING:  # the same names, for editors and type checkers; a test compa
     from pyro_dynogp.models.nonlinear_feedback import NonlinearFeedback as NonlinearFeedback
     from pyro_dynogp.models.priors import sample_modes as sample_modes
     from pyro_dynogp.models.product import Product as Product
-    from pyro_dynogp.models.step import Step as Step
     from pyro_dynogp.prediction.prediction import Prediction as Prediction
     from pyro_dynogp.prediction.scores import scores as scores
     from pyro_dynogp.report.loop import close_loop as close_loop
@@ -105,7 +105,7 @@ HOMES = {
     "Known": "models.layer",
     "Static": "models.layer",
     "Product": "models.product",
-    "Step": "models.step",
+    "Form": "models.forms",
     "Gaussian": "layers.noise",
     "StudentT": "layers.noise",
     "Heteroscedastic": "layers.noise",
@@ -165,6 +165,7 @@ MOVED = {
     "SameAsPrior": "guides.families.SameAsPrior",
     "SimulationBasedCalibration": "criticism.rank_results.SimulationBasedCalibration",
     "Stack": "criticism.comparison.Stack",
+    "Step": "models.forms.Form",
     "StaticFunction": "layers.functions.StaticFunction",
     "inducing_times": "distributions.inducing.inducing_times",
 }

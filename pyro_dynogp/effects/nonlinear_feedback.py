@@ -16,7 +16,7 @@ from pyro_dynogp.effects.bilinear import dominant_rates, products
 from pyro_dynogp.lti.views import steady_state_gain
 from pyro_dynogp.models.product import is_product
 from pyro_dynogp.models.system import DynamicSystem
-from pyro_dynogp.models.variants import Model, with_feedback, with_products
+from pyro_dynogp.models.variants import Model, with_feedback, with_forms, with_products
 from pyro_dynogp.models.wiring import HIDDEN
 from pyro_dynogp.statistics.bootstrap import Scan
 from pyro_dynogp.statistics.detecting import lasting
@@ -140,8 +140,8 @@ class NonlinearFeedbackOfOutput(Effect):
     """What acts back on the dynamics: spring, friction, outflow, a flow that carries heat.
 
     A function of the output, of a signal of the same states that nothing measures (a velocity, the
-    level of another tank), or one of each; products of the inputs with the output, or with such a
-    signal. A later one of them only where it is certainly better.
+    level of another tank), or one of each; roots, edges and a step of both; products of the inputs
+    with the output, or with such a signal. A later one of them only where it is certainly better.
     """
 
     name = "nonlinear feedback"
@@ -169,7 +169,8 @@ class NonlinearFeedbackOfOutput(Effect):
         leading = [*functions, *products] if share >= ALIKE else functions
         if share == 1.0:
             leading = [*products, *functions]
-        extended = [*leading, with_feedback(model, hidden=True)]
+        forms = [with_forms(model), with_forms(model, hidden=True)]
+        extended = [*leading, *forms, with_feedback(model, hidden=True)]
         return list({repr(variant): variant for variant in extended if variant}.values())
 
     def sentence(self, evidence: Evidence, model: Model) -> str:
@@ -197,43 +198,46 @@ class NonlinearFeedbackOfOutput(Effect):
         """What it does to the dynamics, in numbers.
 
         Of products, the decay rate of the dominant mode where an input is low and where it is high.
-        Of a function, the inverse steady-state gain at the low end, in the middle and at the high
-        end.
+        Of functions of the output, the inverse steady-state gain at the low end, in the middle and
+        at the high end.
 
-        The input that holds the output at y is u(y) = (y - G_f f(y)) / G_u, with steady-state gains
-        G_u from the input and G_f from what comes back. Posterior mean and standard deviation of
+        The input that holds the output at y is u(y) = (y - sum_i G_i f_i(y)) / G_u, with
+        steady-state gains G_u from the input and G_i from what comes back. Posterior mean and standard deviation of
         its mean slope in each part of the output's range [input / output]; of the input with the
-        largest gain. Standard deviations are those of the fit's draws: by default they know the
-        function alone, as poles and gains stay at their optimum. None for several outputs, for
+        largest gain. Standard deviations are those of the fit's draws: by default they know a
+        Gaussian process alone, as poles and gains stay at their optimum beside one. None for several outputs, for
         integrators, without inputs, and where the output is a function of what acts back.
         """
         model, scaling = fit.model, fit.scaling
         fed = [wire for wire in model.wires if wire.feedback]
-        if model.outputs > 1 or len(fed) != 1 or len(fed[0].feedback) != 1 or not fed[0].last:
+        if model.outputs > 1 or len(fed) != 1 or not fed[0].last:
             return {}
-        if any(is_product(w.layer) for w in model.wires if w.name in fed[0].feedback):
-            return dominant_rates(fit, fed[0], record)
-        if len(fed[0].signals) > 1:  # what it sees is hidden
+        names = fed[0].feedback
+        if any(is_product(w.layer) for w in model.wires if w.name in names):
+            return dominant_rates(fit, fed[0], record) if len(names) == 1 else {}
+        if len(fed[0].signals) > 1:  # what they see is hidden
             return {}
-        system, (name,) = fit.system_at(fit.draws), fed[0].feedback
-        dynamic, function = system.layer(fed[0].name), system.layer(name)
+        system = fit.system_at(fit.draws)
+        dynamic = system.layer(fed[0].name)
         assert isinstance(dynamic, DynamicSystem)
-        assert not isinstance(function, DynamicSystem)
         if bool((dynamic.modes.poles == 0).any()) or fed[0].sources != ("inputs",):
             return {}
         gains = steady_state_gain(dynamic.modes).numpy()
         gains = gains.reshape(-1, gains.shape[-1])
-        if gains.shape[1] == 1:
+        if gains.shape[1] == len(names):
             return {}
-        of_inputs, back = gains[:, :-1], gains[:, -1:]
+        of_inputs, back = gains[:, : -len(names)], gains[:, -len(names) :]
         which = int(np.abs(of_inputs).mean(0).argmax())
         y = record.outputs[:, 0]
         at = np.quantile(y[np.isfinite(y)], PARTS)
         scaled = (at - scaling.output_offset[0]) / scaling.output_scale[0]
         with torch.no_grad():
-            values = function.mean(as_tensor(scaled[:, None]), scaled)
-        f = values.numpy().reshape(-1, len(at))
-        u = (scaled - back * f) / of_inputs[:, [which]]
+            x = as_tensor(scaled[:, None])
+            values = [
+                system.layer(name).mean(x, scaled).numpy().reshape(-1, len(at)) for name in names
+            ]
+        fed_back = sum(gain[:, None] * f for gain, f in zip(back.T, values, strict=True))
+        u = (scaled - fed_back) / of_inputs[:, [which]]
         slopes = np.diff(u) / np.diff(scaled) * scaling.input_scale[which] / scaling.output_scale[0]
         unit = "/".join(x or "1" for x in (scaling.input_units[which], scaling.output_units[0]))
         unit = "" if unit == "1/1" else unit

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Any
 
+from pyro_dynogp.models.forms import FORMS, Form, form_of
 from pyro_dynogp.models.product import Product, factors, is_product
-from pyro_dynogp.models.step import Step, is_step
 from pyro_dynogp.models.wiring import Dynamic, Known, Layer, Static
 
 LAYERS: dict[str, Callable[..., Layer]] = {
-    "Dynamic": Dynamic, "Static": Static, "Step": Step, "Product": Product,
+    "Dynamic": Dynamic, "Static": Static, "Product": Product,
+    **{form.capitalize(): functools.partial(Form, form) for form in FORMS},
 }  # fmt: skip
 
 
@@ -21,8 +23,8 @@ def plain_layer(layer: Layer) -> dict[str, Any] | None:
         names = [f.name for f in fields(layer)]
         return {"kind": type(layer).__name__, **{name: getattr(layer, name) for name in names}}
     wired = {name: getattr(layer, name) for name in ("skip", "sees", "name")}
-    if is_step(layer):
-        return {"kind": "Step", **wired}
+    if form := form_of(layer):
+        return {"kind": form.capitalize(), **wired}
     if is_product(layer):
         first = factors(layer)
         return {"kind": "Product", "first": first, "others": layer.outputs // first, **wired}

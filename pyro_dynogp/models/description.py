@@ -6,9 +6,9 @@ from dataclasses import dataclass, fields, replace
 
 from pyro_dynogp.data.channels import Channel
 from pyro_dynogp.layers.noise import Likelihood
+from pyro_dynogp.models.forms import form_of
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.product import is_product
-from pyro_dynogp.models.step import is_step
 from pyro_dynogp.models.wiring import Dynamic, Known, Layer
 
 
@@ -54,7 +54,7 @@ def describe(model: Model) -> tuple[Part, ...]:
 
 def kind_of(layer: Known) -> str:
     """What a function that is known is called."""
-    return "step" if is_step(layer) else "product" if is_product(layer) else "known function"
+    return form_of(layer) or ("product" if is_product(layer) else "known function")
 
 
 def _layer(layer: Layer, *, fed_back: bool) -> Part:

@@ -8,12 +8,15 @@ from gpytorch.kernels import Kernel
 
 from pyro_dynogp.layers.noise import Gaussian, Likelihood
 from pyro_dynogp.models.arrival import free_delays
+from pyro_dynogp.models.forms import Form, form_of, forms_of, usual_substeps
 from pyro_dynogp.models.layer import fed_back
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.step import Step, usual_substeps
 from pyro_dynogp.models.structure import ModelOptions
-from pyro_dynogp.models.wiring import Dynamic, Layer
+from pyro_dynogp.models.wiring import Dynamic, StaticLayer
 from pyro_dynogp.support.errors import SWITCH, invalid, verify
+
+# Inducing values of functions.
+INDUCING = 32
 
 
 def NonlinearFeedback(
@@ -23,8 +26,9 @@ def NonlinearFeedback(
     pairs: int = 1,
     hidden: int = 0,
     step: bool | None = None,
+    parametric: bool = False,
     substeps: int | None = None,
-    inducing: int = 32,
+    inducing: int = INDUCING,
     kernel: Kernel | None = None,
     process_noise: bool = True,
     likelihood: Likelihood | None = None,
@@ -35,9 +39,14 @@ def NonlinearFeedback(
     A spring or friction that is not linear, a tank that empties through a valve:
     x' = A x + B u + F f(C x), y = C x + D u, with f held for a step or a part of it. Beyond the
     data f keeps its value. With hidden signals there is a second function f2 of h = H x, and f is
-    named f1: friction where the position is measured, a tank above the one that is. A `Step` beside
+    named f1: friction where the position is measured, a tank above the one that is. A step beside
     them is what Gaussian processes are too smooth for: a friction that changes sign, an edge that
     a tank flows over.
+
+    With `parametric` nothing is a Gaussian process: what comes back are a root and an edge of the
+    output, and of the hidden signal, and a step of the latter, or of the output where there is no
+    hidden signal (see `Form`). Tanks and valves need fewer data so, and all parameters have
+    posteriors.
 
     Arguments are those of `Wiener`. f sees all outputs and has as many; that of g is measured.
 
@@ -45,8 +54,10 @@ def NonlinearFeedback(
         hidden: number of signals that f2 sees and has as outputs.
         step: whether a step of the hidden signal, or of the output where there is none, comes back
             as well; by default with one hidden signal.
+        parametric: whether what comes back has parametric forms. For one output and at most one
+            hidden signal; `step`, `inducing` and `kernel` are of functions that are no such forms.
         substeps: equal parts of each interval between samples in which the functions are computed
-            anew; by default 3 with a `Step`, 1 without and beside dead times that are parameters.
+            anew; by default 3 with a `Form`, 1 without and beside dead times that are parameters.
         kernel: of the functions, a gpytorch kernel; by default Matern-5/2 with a lengthscale of at
             least twice the distance between inducing locations.
 
@@ -56,36 +67,67 @@ def NonlinearFeedback(
         (['g', 'f'], 'g')
         >>> [wire.name for wire in NonlinearFeedback(1, hidden=1).wires]
         ['g', 'f1', 'f2', 'step']
+        >>> [wire.name for wire in NonlinearFeedback(1, parametric=True).wires]
+        ['g', 'g_root', 'g_edge', 'g_step']
     """
     verify(hidden=hidden)
+    SWITCH.check("parametric", parametric)
     if step is not None:
         SWITCH.check("step", step)
+    if parametric:
+        _check_parametric(outputs, hidden, step, kernel, inducing)
+        functions: list[StaticLayer] = [*forms_of("g", hidden=bool(hidden))]
+    else:
+        functions = _smooth(outputs, hidden, step, inducing, kernel)
+    if substeps is None:
+        late = bool(free_delays(options.get("channels", ())))
+        substeps = usual_substeps(forms=any(map(form_of, functions)), late=late)
+    dynamic = Dynamic(
+        outputs=outputs,
+        pairs=pairs,
+        process_noise=process_noise,
+        feedback=tuple(str(function.name) for function in functions),
+        hidden=hidden,
+        substeps=substeps,
+    )
+    looped: ModelOptions = {"integrate": "all", "output": "g", **options}
+    return Model(inputs, (dynamic, *functions), likelihood or Gaussian(), **looped)
+
+
+def _smooth(
+    outputs: int, hidden: int, step: bool | None, inducing: int, kernel: Kernel | None
+) -> list[StaticLayer]:
+    """Gaussian processes of the output and of hidden signals, and a step."""
     width = hidden or outputs
     if step and width > 1:
         raise invalid(
             "step", expected="None or False: a step sees one signal", got=f"True, {width} signals",
-            advice="A Cascade takes Step layers that see layers of one signal each.",
+            advice="A Cascade takes Form layers that see layers of one signal each.",
         )  # fmt: skip
     step = hidden == 1 if step is None else step
-    back: tuple[str, ...] = ("f1", "f2") if hidden else ("f1",) if step else ("f",)
-    back = (*back, "step") if step else back
-    if substeps is None:
-        late = bool(free_delays(options.get("channels", ())))
-        substeps = usual_substeps(steps=step, late=late)
-    layers: list[Layer] = [
-        Dynamic(
-            outputs=outputs,
-            pairs=pairs,
-            process_noise=process_noise,
-            feedback=back,
-            hidden=hidden,
-            substeps=substeps,
-        ),
-        fed_back(outputs, inducing=inducing, kernel=kernel),
-    ]
+    first = "f1" if hidden or step else "f"
+    functions: list[StaticLayer] = [fed_back(outputs, inducing=inducing, kernel=kernel, name=first)]
     if hidden:
-        layers.append(fed_back(hidden, inducing=inducing, kernel=kernel, sees=("g_hidden",)))
+        sees = ("g_hidden",)
+        functions.append(fed_back(hidden, inducing=inducing, kernel=kernel, sees=sees, name="f2"))
     if step:
-        layers.append(Step(sees=("g_hidden" if hidden else "g",), name="step"))
-    looped: ModelOptions = {"integrate": "all", "output": "g", **options}
-    return Model(inputs, tuple(layers), likelihood or Gaussian(), **looped)
+        functions.append(Form("step", sees=("g_hidden" if hidden else "g",), name="step"))
+    return functions
+
+
+def _check_parametric(
+    outputs: int, hidden: int, step: bool | None, kernel: Kernel | None, inducing: int
+) -> None:
+    """Refuse what parametric forms have no use for."""
+    if outputs > 1 or hidden > 1:
+        raise invalid(
+            "parametric", expected="False for several outputs or hidden signals",
+            got=f"True, outputs={outputs}, hidden={hidden}",
+            advice="A Cascade takes Form layers that see layers of one signal each.",
+        )  # fmt: skip
+    if step is not None or kernel is not None or inducing != INDUCING:
+        raise invalid(
+            "parametric", expected="False beside step, kernel or inducing",
+            got=f"True, step={step}, kernel={type(kernel).__name__}, inducing={inducing}",
+            advice="They are of Gaussian processes, and of a step beside them.",
+        )  # fmt: skip

@@ -8,10 +8,10 @@ from dataclasses import replace
 
 from pyro_dynogp.data.channels import Channel, count_direct
 from pyro_dynogp.layers.noise import Likelihood
+from pyro_dynogp.models.forms import Form, form_of, forms_of, usual_substeps
 from pyro_dynogp.models.layer import fed_back
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.product import Product, factors, is_product
-from pyro_dynogp.models.step import Step, is_step, usual_substeps
 from pyro_dynogp.models.wiring import (
     HIDDEN,
     INPUTS,
@@ -208,8 +208,25 @@ def with_feedback(model: Model, *, output: bool = True, hidden: bool = False) ->
         back.append(fed_back(layer.outputs, inducing=INDUCING, sees=own, name=FEEDBACK))
     if hidden:
         function = fed_back(1, inducing=INDUCING, sees=unseen, name=HIDDEN_FEEDBACK)
-        back += [function, Step(sees=unseen, name=STEP)]
+        back += [function, Form("step", sees=unseen, name=STEP)]
     return _fed_back(model, back, hidden=hidden)
+
+
+def with_forms(model: Model, *, hidden: bool = False) -> Model | None:
+    """The model with parametric forms of its last dynamic layer that act back on it.
+
+    None for several outputs or hidden signals, and where `with_feedback` is None.
+
+    Args:
+        model: to extend. hidden: whether some see a further signal of the same states, which
+            nothing measures; see `forms_of`.
+    """
+    if not model.dynamic:
+        return None
+    seen, layer = model.dynamic[-1]
+    if layer.outputs > 1 or layer.hidden > 1:
+        return None
+    return _fed_back(model, forms_of(seen.name, hidden=hidden), hidden=hidden)
 
 
 def with_products(model: Model, *, hidden: bool = False) -> Model | None:
@@ -271,11 +288,11 @@ def with_usual_substeps(model: Model, base: Model | None = None) -> Model:
         return model
 
     def finer(_: Wire, layer: Dynamic) -> Dynamic:
-        steps = any(
-            w.name in layer.feedback and (is_step(w.layer) or is_product(w.layer))
+        forms = any(
+            w.name in layer.feedback and (form_of(w.layer) is not None or is_product(w.layer))
             for w in model.wires
         )
-        parts = usual_substeps(steps=steps, late=bool(model.late))
+        parts = usual_substeps(forms=forms, late=bool(model.late))
         return replace(layer, substeps=max(layer.substeps, parts))
 
     return with_dynamics(model, finer)

@@ -146,6 +146,8 @@ class TestBlock:
         wired = [{w.name: (w.sources, w.feedback) for w in model.wires} for model in variants]
         output, hidden = (("g",), ()), (("g_hidden",), ())
         unseen = ("hidden_feedback", "feedback_step")
+        forms = ("g_root", "g_edge", "g_step")
+        more = (*forms[:2], "g_hidden_root", "g_hidden_edge", "g_hidden_step")
         assert wired == [
             {"g": (("inputs",), ("feedback",)), "feedback": output},
             {"g": (("inputs",), unseen), **dict.fromkeys(unseen, hidden)},
@@ -153,6 +155,9 @@ class TestBlock:
              "feedback_product": (("inputs", "g"), ())},
             {"g": (("inputs",), ("hidden_product",)),
              "hidden_product": (("inputs", "g_hidden"), ())},
+            {"g": (("inputs",), forms), **dict.fromkeys(forms, output)},
+            {"g": (("inputs",), more), **dict.fromkeys(more[:2], output),
+             **dict.fromkeys(more[2:], hidden)},
             {"g": (("inputs",), ("feedback", *unseen)), "feedback": output,
              **dict.fromkeys(unseen, hidden)},
         ]  # fmt: skip
@@ -167,8 +172,10 @@ class TestBlock:
             "Inputs times 'x' act back on its dynamics.",
             "Inputs times a signal of the dynamics of 'x' that is not measured act back on its "
             "dynamics.",
-            "Nonlinear functions of 'x', and of a signal of the dynamics of 'x' that is not "
-            "measured, act back on them.",
+            "What the test said.",
+            both := "Nonlinear functions of 'x', and of a signal of the dynamics of 'x' that is "
+            "not measured, act back on them.",
+            both,
         ]
 
     @pytest.mark.parametrize(
@@ -183,7 +190,9 @@ class TestBlock:
     def test_products_are_tried_by_what_the_test_says_of_them(self, spring, share, leading):
         said = SimpleNamespace(where={"output": "x", "products": share})
         made = EFFECT.extend(dgp.LinearDynamicGP(1), said, spring)
-        assert [one.dynamic[0][0].feedback[0] for one in made] == [*leading, "feedback"]
+        assert [one.dynamic[0][0].feedback[0] for one in made] == [
+            *leading, "g_root", "g_root", "feedback"
+        ]  # fmt: skip
         assert made[-1].dynamic[0][0].feedback == (
             "feedback", "hidden_feedback", "feedback_step"
         )  # fmt: skip
@@ -196,17 +205,24 @@ class TestBlock:
 
     def test_what_is_there_is_not_added_again(self, spring):
         """To a function of the output one of a hidden signal, and the other way round."""
-        first, second, product, hidden, both = EFFECT.extend(dgp.LinearDynamicGP(1), SAID, spring)
+        made = EFFECT.extend(dgp.LinearDynamicGP(1), SAID, spring)
+        first, second, product, hidden, forms, more, both = made
         back = {"feedback", "hidden_feedback", "feedback_step"}
         products = [{"feedback_product"}, {"hidden_product"}]
-        for model in (first, second):
+        of_output = {"g_root", "g_edge", "g_step"}
+        of_hidden = {"g_hidden_root", "g_hidden_edge", "g_hidden_step"}
+        for model, others in ((first, of_hidden), (second, of_output)):
             own = set(model.dynamic[0][0].feedback)
-            more = EFFECT.extend(model, SAID, spring)
-            made = [set(one.dynamic[0][0].feedback) for one in more]
-            assert made == [back, own | products[0], own | products[1]]
-            assert more[0].dynamic[0][1].hidden == 1
-        assert len(EFFECT.extend(both, SAID, spring)) == 2
-        assert len(EFFECT.extend(product, SAID, spring)) == 4
+            extended = EFFECT.extend(model, SAID, spring)
+            made = [set(one.dynamic[0][0].feedback) for one in extended]
+            assert made[:3] == [back, own | products[0], own | products[1]]
+            assert own | others in made
+            assert extended[0].dynamic[0][1].hidden == 1
+        made = [set(one.dynamic[0][0].feedback) for one in EFFECT.extend(forms, SAID, spring)]
+        assert of_output | of_hidden in made
+        for model in (more, both):
+            assert len(EFFECT.extend(model, SAID, spring)) == 2  # products
+        assert len(EFFECT.extend(product, SAID, spring)) == 6
         for model in (product, hidden):
             assert model not in EFFECT.extend(model, SAID, spring)
         own, *_ = EFFECT.extend(dgp.NonlinearFeedback(1), SAID, spring)

@@ -152,7 +152,7 @@ def test_each_of_the_first_is_multiplied_with_each_of_the_others():
     signals = [torch.full((4,), x) for x in (2.0, 3.0, 5.0, 7.0, 11.0)]
     assert layer.function(*signals)[0].tolist() == [10.0, 14.0, 22.0, 15.0, 21.0, 33.0]
     assert dgp.Product().function(*signals[:2]).tolist() == [6.0] * 4
-    for other in (dgp.Step(), dgp.Static(), dgp.Known(torch.mul)):
+    for other in (dgp.Form("step"), dgp.Static(), dgp.Known(torch.mul)):
         assert (factors(other), is_product(other)) == (0, False)
 
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 import pyro_dynogp as dgp
-from pyro_dynogp.models.step import SUBSTEPS
+from pyro_dynogp.models.forms import SUBSTEPS
 from pyro_dynogp.models.variants import with_feedback, with_usual_substeps
 from pyro_dynogp.report import loop
 

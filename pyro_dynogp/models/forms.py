@@ -1,0 +1,158 @@
+"""Parametric forms of static functions: a step, a root, an edge.
+
+Each is a `Known` layer of one signal with one or two parameters, for what plants often have in
+feedback.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Literal
+
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from pyro_dynogp.models.layer import Known, Layer
+from pyro_dynogp.models.wiring import HIDDEN
+from pyro_dynogp.support.errors import invalid
+from pyro_dynogp.support.frozen import FrozenMapping
+
+# Of the logarithm of a width in standard deviations of the signal: most from 0.02 to 1.
+WIDTH, SPREAD = -2.0, 1.0
+# Standard deviations of the signal over which a root is rounded where it begins, and its square
+# there: roots have no slope at zero.
+ROUNDED, LEAST = 0.1, 1e-4
+# Where a root begins, and an edge lies, by their priors: levels are mostly above the one, and
+# seldom above the other.
+BEGINS, LEVEL = -2.0, 1.0
+FormName = Literal["step", "root", "edge"]
+# Parts of each interval between samples in which feedback with a form is computed anew by default.
+SUBSTEPS = 3
+
+
+def usual_substeps(*, forms: bool, late: bool) -> int:
+    """Parts of each interval where a form is in feedback; one beside free dead times."""
+    return SUBSTEPS if forms and not late else 1
+
+
+def step(x: Tensor, at: Tensor, width: Tensor) -> Tensor:
+    """tanh((x - at) / width)."""
+    return ((x - at) / width).tanh()
+
+
+def root(x: Tensor, at: Tensor) -> Tensor:
+    """sqrt(x - at), rounded where it begins, and zero below."""
+    return (ROUNDED * softplus((x - at) / ROUNDED) + LEAST).sqrt()
+
+
+def edge(x: Tensor, at: Tensor, width: Tensor) -> Tensor:
+    """X - at above `at`, zero below, rounded over the width."""
+    return width * softplus((x - at) / width)
+
+
+class _Priors(FrozenMapping[str, dist.Distribution]):
+    """The same object in copies and in other processes: distributions are equal to themselves."""
+
+    def __init__(self, name: str, items: Mapping[str, dist.Distribution]) -> None:
+        super().__init__(items)
+        self.name = name
+
+    def __reduce__(self) -> str:
+        return self.name
+
+    def __deepcopy__(self, memo: dict[int, object]) -> _Priors:
+        return self
+
+
+def _normal(mean: float) -> dist.Distribution:
+    return dist.Normal(_number(mean), _number(1.0))
+
+
+def _width() -> dist.Distribution:
+    return dist.LogNormal(_number(WIDTH), _number(SPREAD))
+
+
+def _number(value: float) -> Tensor:
+    return torch.tensor(value, dtype=torch.float64)
+
+
+STEP = _Priors("STEP", {"at": _normal(0.0), "width": _width()})
+ROOT = _Priors("ROOT", {"at": _normal(BEGINS)})
+EDGE = _Priors("EDGE", {"at": _normal(LEVEL), "width": _width()})
+# Function and priors of each form.
+FORMS: Mapping[FormName, tuple[Callable[..., Tensor], _Priors]] = MappingProxyType(
+    {"step": (step, STEP), "root": (root, ROOT), "edge": (edge, EDGE)}
+)
+
+
+def Form(
+    form: FormName,
+    *,
+    skip: tuple[str, ...] = (),
+    sees: tuple[str, ...] = (),
+    name: str | None = None,
+) -> Known:
+    r"""A static layer of one signal x whose function has a given form and one or two parameters.
+
+    - "step": tanh((x - at) / width). In feedback Coulomb's friction, where x is a velocity.
+    - "root": the square root of x - at, zero below. The outflow of a tank by Torricelli's law,
+      where x is a level; the flow through a valve, where x is a pressure. It is
+      sqrt(r(x - at) + 1e-4), r(z) = 0.1 log(1 + exp(z / 0.1)), and so has a slope everywhere.
+    - "edge": x - at, zero below; width log(1 + exp((x - at) / width)). What flows over the edge of
+      a tank, a stop that a mass hits, a valve that opens.
+
+    A Gaussian process can take the same shapes, but needs many inducing values for an edge, has to
+    learn from the data where a function bends, and keeps its value beyond them. The gains of the
+    layer that sees a form are its size and sign.
+
+    Sites: ``<layer>_at``, normal with mean 0 (step), -2 (root) or 1 (edge) and standard deviation
+    1; ``<layer>_width``, LogNormal(-2, 1), of a step and of an edge. Inputs and the output are seen
+    as standard deviations from their mean, signals of dynamics as they are.
+
+    Args:
+        form: "step", "root" or "edge".
+        skip: names of earlier signals that the layer sees too. sees: those that it sees instead.
+        name: prefix of its sites; f, or f1, f2, ... by default.
+
+    Returns:
+        A `Known` layer, which unlike others can be saved.
+
+    Raises:
+        ValueError: on an unknown form.
+
+    Examples:
+        >>> sorted(dgp.Form("edge", sees=("g_hidden",)).parameters)
+        ['at', 'width']
+        >>> sorted(Form("root").parameters)
+        ['at']
+    """
+    if form not in FORMS:
+        expected = ", ".join(repr(known) for known in FORMS)
+        raise invalid("form", expected=f"one of {expected}", got=repr(form))
+    function, priors = FORMS[form]
+    return Known(function, priors, scaled=True, skip=skip, sees=sees, name=name)
+
+
+def forms_of(name: str, *, hidden: bool) -> list[Known]:
+    """The forms that a dynamic layer usually has in feedback.
+
+    A root and an edge of its output, and of its hidden signal; a step of the latter, or of the
+    output where there is no other signal.
+
+    Args:
+        name: of the layer. hidden: whether it has a hidden signal.
+    """
+    signals = [name, name + HIDDEN] if hidden else [name]
+    seen: list[tuple[str, FormName]] = [(x, form) for x in signals for form in ("root", "edge")]
+    seen.append((signals[-1], "step"))
+    return [Form(form, sees=(signal,), name=f"{signal}_{form}") for signal, form in seen]
+
+
+def form_of(layer: Layer) -> FormName | None:
+    """The form of a layer that `Form` makes, else None."""
+    if not isinstance(layer, Known):
+        return None
+    return next((form for form, (f, _) in FORMS.items() if layer.function is f), None)
