@@ -202,11 +202,12 @@ class NonlinearFeedbackOfOutput(Effect):
         at the high end.
 
         The input that holds the output at y is u(y) = (y - sum_i G_i f_i(y)) / G_u, with
-        steady-state gains G_u from the input and G_i from what comes back. Posterior mean and standard deviation of
-        its mean slope in each part of the output's range [input / output]; of the input with the
-        largest gain. Standard deviations are those of the fit's draws: by default they know a
-        Gaussian process alone, as poles and gains stay at their optimum beside one. None for several outputs, for
-        integrators, without inputs, and where the output is a function of what acts back.
+        steady-state gains G_u from the input and G_i from what comes back. Posterior mean and
+        standard deviation of its mean slope in each part of the output's range [input / output]; of
+        the input with the largest gain. Standard deviations are those of the fit's draws: by
+        default they know a Gaussian process alone, as poles and gains stay at their optimum beside
+        one. None for several outputs, for integrators, without inputs, and where the output is a
+        function of what acts back.
         """
         model, scaling = fit.model, fit.scaling
         fed = [wire for wire in model.wires if wire.feedback]

@@ -301,6 +301,34 @@ class TestNumbers:
         expected = [(v * (1 / 2 + 1 / 4) / 2, abs(v) * (1 / 2 - 1 / 4) / 2) for v in slope]
         np.testing.assert_allclose(list(found.values()), expected, rtol=1e-12)
 
+    def test_functions_of_the_output_add_up(self):
+        """u(y) = (y - G_1 f_1(y) - G_2 f_2(y) - G_3 f_3(y)) / G_u."""
+        gains = torch.tensor([[2.0, -1.0, 0.5, 3.0]]).double()
+        pole = torch.full((1, 1), -1.0 + 0.0j, dtype=torch.complex128)
+        modes = dgp.Modes(pole, input_gain=gains.unsqueeze(1) + 0.0j, output_gain=0.5 + 0.0 * pole)
+        functions = {"g_root": torch.square, "g_edge": torch.exp, "g_step": torch.sin}
+        layers = {k: SimpleNamespace(mean=lambda x, _, f=f: f(x)) for k, f in functions.items()}
+        layers["g"] = DynamicSystem(modes, 1.0)
+        system = SimpleNamespace(layer=layers.__getitem__)
+        scaling = SimpleNamespace(
+            input_scale=np.ones(1), output_scale=np.ones(1), output_offset=np.zeros(1),
+            input_names=("u",), input_units=("",), output_units=("",),
+        )  # fmt: skip
+        model = dgp.NonlinearFeedback(1, parametric=True)
+        fit = SimpleNamespace(model=model, scaling=scaling, draws={}, system_at=lambda _: system)
+        record = SimpleNamespace(outputs=np.linspace(0.0, 2.0, 101)[:, None])
+        y = np.quantile(record.outputs, (0.02, 0.35, 0.65, 0.98))
+        u = (y + y**2 - 0.5 * np.exp(y) - 3.0 * np.sin(y)) / 2.0
+        slopes = [mean for mean, _ in EFFECT.parameters(fit, None, record).values()]
+        np.testing.assert_allclose(slopes, np.diff(u) / np.diff(y), rtol=1e-12)
+        for model in (
+            dgp.NonlinearFeedback(1, hidden=1, parametric=True),
+            with_products(dgp.NonlinearFeedback(1)),
+        ):
+            assert (
+                EFFECT.parameters(SimpleNamespace(model=model, scaling=scaling), None, record) == {}
+            )
+
     def test_none_for_what_has_no_steady_state(self, spring):
         line = SimpleNamespace(model=dgp.LinearDynamicGP(1), scaling=None)
         assert EFFECT.parameters(line, SAID, spring) == {}

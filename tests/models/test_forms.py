@@ -19,14 +19,22 @@ from tests.models.closed_loops import check_gradient, make_record, system_at
 from tests.models.test_known import values_at
 
 SEES = pytest.mark.parametrize(("sees", "hidden"), [("g", 0), ("g_hidden", 1)])
-EACH = pytest.mark.parametrize("form", ["step", "root", "edge"])
+EACH = pytest.mark.parametrize("form", ["step", "root", "edge", "cube"])
 # The forms in numpy, and where and how wide they are in the middle of their priors.
 PLAIN = {
     "step": lambda x, at, width: np.tanh((x - at) / width),
     "root": lambda x, at, width: np.sqrt(0.1 * np.logaddexp(0.0, (x - at) / 0.1) + 1e-4),
     "edge": lambda x, at, width: width * np.logaddexp(0.0, (x - at) / width),
+    "cube": lambda x, at, width: (x - at) ** 3,
 }
-MIDDLE = {"step": (0.0, np.exp(-2.0)), "root": (-2.0, None), "edge": (1.0, np.exp(-2.0))}
+MIDDLE = {
+    "step": (0.0, np.exp(-2.0)),
+    "root": (-2.0, None),
+    "edge": (1.0, np.exp(-2.0)),
+    "cube": (0.0, None),
+}
+# Those of no width.
+NARROW = ("root", "cube")
 
 
 def looped(record, sees, hidden, form="step", **options):
@@ -36,7 +44,7 @@ def looped(record, sees, hidden, form="step", **options):
 
 def placed(form, at, width):
     """Sites of a form's place and width, as far as it has them."""
-    given = {"f_at": at} | ({} if form == "root" else {"f_width": width})
+    given = {"f_at": at} | ({} if form in NARROW else {"f_width": width})
     return {k: torch.tensor(v, dtype=torch.float64) for k, v in given.items()}
 
 
@@ -101,7 +109,7 @@ def test_its_place_and_width_matter(sees, hidden, form):
 
     start = density(0.0, 0.2)
     assert abs(density(0.3, 0.2) - start) > 1e-3
-    assert form == "root" or abs(density(0.0, 0.6) - start) > 1e-3
+    assert form in NARROW or abs(density(0.0, 0.6) - start) > 1e-3
 
 
 @EACH
@@ -118,8 +126,10 @@ def test_copies_are_the_same_layer_also_in_another_process(form):
 def test_other_functions_are_no_forms():
     assert form_of(dgp.Known(lambda x, at: x - at, {"at": dist.Normal(0.0, 1.0)})) is None
     assert form_of(dgp.Static()) is None
-    with pytest.raises(ValueError, match="form: expected one of 'step', 'root', 'edge', got 'cub"):
-        dgp.Form("cube")
+    with pytest.raises(
+        ValueError, match="form: expected one of 'step', 'root', 'edge', 'cube', got 'square"
+    ):
+        dgp.Form("square")
     with pytest.raises(AttributeError, match=r"it is now pyro_dynogp\.models\.forms\.Form"):
         dgp.Step  # noqa: B018
 
