@@ -192,6 +192,15 @@ class Structure:
 
     @property
     def learns_function(self) -> bool:
+        """Whether a static layer is a Gaussian process, or one in feedback has parameters."""
+        back = {name for wire in self.wires for name in wire.feedback}
+        return self.has_gaussian_process or any(
+            isinstance(w.layer, Known) and bool(w.layer.parameters) and w.name in back
+            for w in self.wires
+        )
+
+    @property
+    def has_gaussian_process(self) -> bool:
         """Whether there is a static layer whose function is a Gaussian process."""
         return any(isinstance(layer, Static) for layer in self.layers)
 

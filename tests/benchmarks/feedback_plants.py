@@ -56,6 +56,7 @@ KINDS: Mapping[str, tuple[Simulator, Maker]] = {
         lambda: dgp.NonlinearFeedback(1),
     ),
     "tanks": (tanks, lambda: dgp.NonlinearFeedback(1, hidden=1)),
+    "tanks with forms": (tanks, lambda: dgp.NonlinearFeedback(1, hidden=1, parametric=True)),
     "friction": (
         lambda seed, noise: simulate_friction(seed, noise_ratio=noise),
         lambda: dgp.NonlinearFeedback(1, hidden=1),

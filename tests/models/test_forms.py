@@ -11,6 +11,7 @@ import torch
 
 import pyro_dynogp as dgp
 from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.free_runs import noise_sites
 from pyro_dynogp.inference.starts.plans import Plan, plans, starting_point
 from pyro_dynogp.models.forms import form_of
 from pyro_dynogp.models.outputs import output_process
@@ -240,3 +241,30 @@ def test_a_file_keeps_them(tmp_path, options):
     np.testing.assert_array_equal(again.simulate(record).mean, fit.simulate(record).mean)
     assert "step: at" in str(fit.summary())
     assert "step" in repr(fit)
+
+
+@pytest.mark.parametrize(("samples", "learnt"), [(160, True), (150, False)])
+def test_what_free_runs_have_ruled_out_does_not_come_back_with_draws(samples, learnt):
+    """Along more than 150 samples poles and noise stay where free runs have put them."""
+    record = make_record(n=samples, missing=False)
+    fit = dgp.fit(dgp.NonlinearFeedback(1, parametric=True), record, restarts=1, steps=4, workers=1,
+                  progress=False)  # fmt: skip
+    moving = {name for name, x in fit.draws.items() if not torch.equal(x, x[:1].expand_as(x))}
+    forms = {"g_root_at", "g_edge_at", "g_edge_width", "g_step_at", "g_step_width"}
+    assert moving >= forms
+    others = {"g_log_decay", "noise_sd", *noise_sites(fit.model)}
+    assert moving.isdisjoint(others) == learnt
+    assert fit.method == ("svi" if learnt else "importance")
+
+
+def test_which_models_learn_a_function():
+    back = dgp.Dynamic(pairs=1, feedback=("f",))
+    known = dgp.Known(torch.tanh)
+    product = dgp.Product(1, sees=("inputs", "g"), name="f")
+    for layer, expected in (
+        (dgp.Form("root"), True), (dgp.Static(), True), (known, False), (product, False),
+    ):  # fmt: skip
+        assert dgp.Cascade(1, (back, layer), output="g").learns_function is expected
+    sensor = dgp.Cascade(1, (dgp.Dynamic(pairs=1), dgp.Form("root")))
+    assert not sensor.learns_function  # forwards
+    assert not dgp.Cascade(1, (back, dgp.Form("root")), output="g").has_gaussian_process

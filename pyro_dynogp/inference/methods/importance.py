@@ -41,8 +41,9 @@ class Importance:
     Annealing takes about as long as the climbs or longer, and matters less the longer a record is.
     Along more than `longest` samples, where k asks for it, the fit is the posterior mode instead.
     Models with static functions have along more than `longest` samples the posterior that `Normal`
-    gives: inducing values and first states alone have draws, all else stays at its optimum. Without
-    functions to learn (`Product`) it is a normal of all parameters, where k asks for another one.
+    gives: inducing values, parameters of known functions in feedback, and first states alone have
+    draws, all else stays at its optimum. Without functions to learn (`Product`) it is a normal of
+    all parameters, where k asks for another one.
 
     Attributes:
         draws: posterior draws to keep, of equal weight.
@@ -93,7 +94,10 @@ def with_draws_around(
     """The fit that draws around several optima, the best first, are."""
     model = problem.model
     longest = longest or (LONGEST_FEEDBACK if model.has_feedback else LONGEST)
-    if model.learns_function:
+    # Process noise that free runs have ruled out would come back as draws are sought.
+    if model.has_gaussian_process or (
+        model.learns_function and samples_of(problem.records) > longest
+    ):
         return _of_functions(problem, optima, run, draws, longest)
     found = sample_around(
         problem.target,
