@@ -153,10 +153,11 @@ def forms_of(name: str, *, hidden: bool) -> list[Known]:
     Args:
         name: of the layer. hidden: whether it has a hidden signal.
     """
-    signals = [name, name + HIDDEN] if hidden else [name]
+    # No name begins with that of the layer, as its sites do.
+    signals = {"output": name} | ({"hidden": name + HIDDEN} if hidden else {})
     seen: list[tuple[str, FormName]] = [(x, form) for x in signals for form in ("root", "edge")]
-    seen.append((signals[-1], "step"))
-    return [Form(form, sees=(signal,), name=f"{signal}_{form}") for signal, form in seen]
+    seen.append(("hidden" if hidden else "output", "step"))
+    return [Form(form, sees=(signals[x],), name=f"{x}_{form}") for x, form in seen]
 
 
 def form_of(layer: Layer) -> FormName | None:

@@ -68,7 +68,7 @@ def NonlinearFeedback(
         >>> [wire.name for wire in NonlinearFeedback(1, hidden=1).wires]
         ['g', 'f1', 'f2', 'step']
         >>> [wire.name for wire in NonlinearFeedback(1, parametric=True).wires]
-        ['g', 'g_root', 'g_edge', 'g_step']
+        ['g', 'output_root', 'output_edge', 'output_step']
     """
     verify(hidden=hidden)
     SWITCH.check("parametric", parametric)

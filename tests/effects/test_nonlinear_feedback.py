@@ -146,8 +146,8 @@ class TestBlock:
         wired = [{w.name: (w.sources, w.feedback) for w in model.wires} for model in variants]
         output, hidden = (("g",), ()), (("g_hidden",), ())
         unseen = ("hidden_feedback", "feedback_step")
-        forms = ("g_root", "g_edge", "g_step")
-        more = (*forms[:2], "g_hidden_root", "g_hidden_edge", "g_hidden_step")
+        forms = ("output_root", "output_edge", "output_step")
+        more = (*forms[:2], "hidden_root", "hidden_edge", "hidden_step")
         assert wired == [
             {"g": (("inputs",), ("feedback",)), "feedback": output},
             {"g": (("inputs",), unseen), **dict.fromkeys(unseen, hidden)},
@@ -191,7 +191,7 @@ class TestBlock:
         said = SimpleNamespace(where={"output": "x", "products": share})
         made = EFFECT.extend(dgp.LinearDynamicGP(1), said, spring)
         assert [one.dynamic[0][0].feedback[0] for one in made] == [
-            *leading, "g_root", "g_root", "feedback"
+            *leading, "output_root", "output_root", "feedback"
         ]  # fmt: skip
         assert made[-1].dynamic[0][0].feedback == (
             "feedback", "hidden_feedback", "feedback_step"
@@ -209,8 +209,8 @@ class TestBlock:
         first, second, product, hidden, forms, more, both = made
         back = {"feedback", "hidden_feedback", "feedback_step"}
         products = [{"feedback_product"}, {"hidden_product"}]
-        of_output = {"g_root", "g_edge", "g_step"}
-        of_hidden = {"g_hidden_root", "g_hidden_edge", "g_hidden_step"}
+        of_output = {"output_root", "output_edge", "output_step"}
+        of_hidden = {"hidden_root", "hidden_edge", "hidden_step"}
         for model, others in ((first, of_hidden), (second, of_output)):
             own = set(model.dynamic[0][0].feedback)
             extended = EFFECT.extend(model, SAID, spring)
@@ -306,7 +306,11 @@ class TestNumbers:
         gains = torch.tensor([[2.0, -1.0, 0.5, 3.0]]).double()
         pole = torch.full((1, 1), -1.0 + 0.0j, dtype=torch.complex128)
         modes = dgp.Modes(pole, input_gain=gains.unsqueeze(1) + 0.0j, output_gain=0.5 + 0.0 * pole)
-        functions = {"g_root": torch.square, "g_edge": torch.exp, "g_step": torch.sin}
+        functions = {
+            "output_root": torch.square,
+            "output_edge": torch.exp,
+            "output_step": torch.sin,
+        }
         layers = {k: SimpleNamespace(mean=lambda x, _, f=f: f(x)) for k, f in functions.items()}
         layers["g"] = DynamicSystem(modes, 1.0)
         system = SimpleNamespace(layer=layers.__getitem__)

@@ -138,16 +138,16 @@ def test_other_functions_are_no_forms():
 def test_the_parametric_model_has_them_alone():
     wires = {w.name: w for w in dgp.NonlinearFeedback(1, hidden=1, parametric=True).wires}
     assert {name: (form_of(w.layer), w.sources) for name, w in wires.items() if name != "g"} == {
-        "g_root": ("root", ("g",)),
-        "g_edge": ("edge", ("g",)),
-        "g_hidden_root": ("root", ("g_hidden",)),
-        "g_hidden_edge": ("edge", ("g_hidden",)),
-        "g_hidden_step": ("step", ("g_hidden",)),
+        "output_root": ("root", ("g",)),
+        "output_edge": ("edge", ("g",)),
+        "hidden_root": ("root", ("g_hidden",)),
+        "hidden_edge": ("edge", ("g_hidden",)),
+        "hidden_step": ("step", ("g_hidden",)),
     }
     assert wires["g"].feedback == tuple(name for name in wires if name != "g")
     assert wires["g"].layer.substeps == 3
     alone = dgp.NonlinearFeedback(1, parametric=True, substeps=2)
-    assert [w.name for w in alone.wires] == ["g", "g_root", "g_edge", "g_step"]
+    assert [w.name for w in alone.wires] == ["g", "output_root", "output_edge", "output_step"]
     assert alone.wires[0].layer.substeps == 2
     for options in ({"hidden": 2}, {"outputs": 2}):
         with pytest.raises(ValueError, match="parametric: expected False for several outputs or"):
@@ -168,8 +168,12 @@ def test_the_loop_adds_those_that_a_model_lacks():
         ]
     assert with_forms(model).substeps == 1  # more where they are better, see the loop's trials
     assert with_usual_substeps(with_forms(model)).substeps == 3
+    both = with_feedback(with_forms(model), output=False, hidden=True)  # no name twice
+    assert len(both.wires) == len({w.name for w in both.wires}) == 6
+    for ready in (with_forms(model, hidden=True), both):  # sites of a layer begin with its name
+        assert not any(w.name.startswith("g_") for w in ready.wires)
     names = {w.name for w in with_forms(with_feedback(model), hidden=True).wires}
-    assert names == {"g", "feedback", "g_hidden_root", "g_hidden_edge", "g_hidden_step"}
+    assert names == {"g", "feedback", "hidden_root", "hidden_edge", "hidden_step"}
     assert with_forms(with_forms(model)) is with_forms(with_feedback(model)) is None
     assert with_forms(dgp.LinearDynamicGP(1, outputs=2)) is None
     assert with_forms(dgp.NonlinearFeedback(1, hidden=2)) is None
@@ -250,7 +254,13 @@ def test_what_free_runs_have_ruled_out_does_not_come_back_with_draws(samples, le
     fit = dgp.fit(dgp.NonlinearFeedback(1, parametric=True), record, restarts=1, steps=4, workers=1,
                   progress=False)  # fmt: skip
     moving = {name for name, x in fit.draws.items() if not torch.equal(x, x[:1].expand_as(x))}
-    forms = {"g_root_at", "g_edge_at", "g_edge_width", "g_step_at", "g_step_width"}
+    forms = {
+        "output_root_at",
+        "output_edge_at",
+        "output_edge_width",
+        "output_step_at",
+        "output_step_width",
+    }
     assert moving >= forms
     others = {"g_log_decay", "noise_sd", *noise_sites(fit.model)}
     assert moving.isdisjoint(others) == learnt
