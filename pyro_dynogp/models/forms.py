@@ -1,4 +1,4 @@
-"""Parametric forms of static functions: a step, a root, an edge.
+"""Parametric forms of static functions: a step, a root, an edge, a cube.
 
 Each is a `Known` layer of one signal with one or two parameters, for what plants often have in
 feedback.
@@ -49,7 +49,7 @@ def root(x: Tensor, at: Tensor) -> Tensor:
 
 
 def edge(x: Tensor, at: Tensor, width: Tensor) -> Tensor:
-    """X - at above `at`, zero below, rounded over the width."""
+    """The part of x above `at`, rounded over the width."""
     return width * softplus((x - at) / width)
 
 

@@ -45,8 +45,7 @@ def NonlinearFeedback(
 
     With `parametric` nothing is a Gaussian process: what comes back are a root and an edge of the
     output, and of the hidden signal, and a step of the latter, or of the output where there is no
-    hidden signal (see `Form`). Tanks and valves need fewer data so, and all parameters have
-    posteriors.
+    hidden signal (see `Form`). Tanks and valves need fewer data so.
 
     Arguments are those of `Wiener`. f sees all outputs and has as many; that of g is measured.
 
