@@ -128,10 +128,14 @@ class Static:
     least_lengthscale: float = 0.0
 
 
+# Inducing values of a function in feedback, and of any that is added to a model.
+INDUCING = 32
+
+
 def fed_back(
     outputs: int,
     *,
-    inducing: int = 32,
+    inducing: int = INDUCING,
     kernel: Kernel | None = None,
     sees: tuple[str, ...] = (),
     name: str | None = None,

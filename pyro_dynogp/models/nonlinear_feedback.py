@@ -9,14 +9,11 @@ from gpytorch.kernels import Kernel
 from pyro_dynogp.layers.noise import Gaussian, Likelihood
 from pyro_dynogp.models.arrival import free_delays
 from pyro_dynogp.models.forms import Form, form_of, forms_of, usual_substeps
-from pyro_dynogp.models.layer import fed_back
+from pyro_dynogp.models.layer import INDUCING, fed_back
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.structure import ModelOptions
 from pyro_dynogp.models.wiring import Dynamic, StaticLayer
 from pyro_dynogp.support.errors import SWITCH, invalid, verify
-
-# Inducing values of functions.
-INDUCING = 32
 
 
 def NonlinearFeedback(

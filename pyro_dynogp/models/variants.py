@@ -9,7 +9,7 @@ from dataclasses import replace
 from pyro_dynogp.data.channels import Channel, count_direct
 from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.models.forms import Form, form_of, forms_of, usual_substeps
-from pyro_dynogp.models.layer import fed_back
+from pyro_dynogp.models.layer import INDUCING, fed_back
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.product import Product, factors, is_product
 from pyro_dynogp.models.wiring import (
@@ -24,8 +24,6 @@ from pyro_dynogp.models.wiring import (
     Wire,
 )
 
-# Inducing values of a function that is added.
-INDUCING = 32
 # Names of functions that act back: of a layer's output, and of a signal of it that is hidden, and
 # of a step of the latter, and products of inputs with the output or with the hidden signal.
 FEEDBACK, HIDDEN_FEEDBACK, STEP = "feedback", "hidden_feedback", "feedback_step"
@@ -205,9 +203,9 @@ def with_feedback(model: Model, *, output: bool = True, hidden: bool = False) ->
     own, unseen = (seen.name,), (seen.name + HIDDEN,)
     back: list[Static | Known] = []
     if output:
-        back.append(fed_back(layer.outputs, inducing=INDUCING, sees=own, name=FEEDBACK))
+        back.append(fed_back(layer.outputs, sees=own, name=FEEDBACK))
     if hidden:
-        function = fed_back(1, inducing=INDUCING, sees=unseen, name=HIDDEN_FEEDBACK)
+        function = fed_back(1, sees=unseen, name=HIDDEN_FEEDBACK)
         back += [function, Form("step", sees=unseen, name=STEP)]
     return _fed_back(model, back, hidden=hidden)
 
