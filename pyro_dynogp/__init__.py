@@ -61,6 +61,7 @@ if TYPE_CHECKING:  # the same names, for editors and type checkers; a test compa
     )
     from pyro_dynogp.models.architectures import Wiener as Wiener
     from pyro_dynogp.models.architectures import WienerHammerstein as WienerHammerstein
+    from pyro_dynogp.models.compartments import Compartments as Compartments
     from pyro_dynogp.models.forms import Form as Form
     from pyro_dynogp.models.layer import Dynamic as Dynamic
     from pyro_dynogp.models.layer import Known as Known
@@ -99,6 +100,7 @@ HOMES = {
     "HammersteinWiener": "models.architectures",
     "NonlinearFeedback": "models.nonlinear_feedback",
     "ParallelWienerHammerstein": "models.architectures",
+    "Compartments": "models.compartments",
     "Cascade": "models.architectures",
     "Model": "models.model",
     "Dynamic": "models.layer",

@@ -14,6 +14,7 @@ from pyro_dynogp.data.signals import hermite, hinges
 from pyro_dynogp.effects.base import Effect, Parameters
 from pyro_dynogp.effects.bilinear import dominant_rates, products
 from pyro_dynogp.lti.views import steady_state_gain
+from pyro_dynogp.models.compartments import in_place_of
 from pyro_dynogp.models.product import is_product
 from pyro_dynogp.models.system import DynamicSystem
 from pyro_dynogp.models.variants import Model, with_feedback, with_forms, with_products
@@ -38,6 +39,8 @@ NAMES = ("low end", "middle", "high end")
 LAGS = 7
 # Standard errors by which two of their slopes must differ to be said to.
 CERTAIN = 2.0
+# Compartments of a chain.
+CHAIN = 2
 # Share of what the best column gains from which on products are tried beside functions.
 ALIKE = 0.5
 
@@ -141,7 +144,8 @@ class NonlinearFeedbackOfOutput(Effect):
 
     A function of the output, of a signal of the same states that nothing measures (a velocity, the
     level of another tank), or one of each; roots, edges and a step of both; products of the inputs
-    with the output, or with such a signal. A later one of them only where it is certainly better.
+    with the output, or with such a signal; two compartments in place of linear dynamics. A later
+    one of them only where it is certainly better.
     """
 
     name = "nonlinear feedback"
@@ -158,7 +162,7 @@ class NonlinearFeedbackOfOutput(Effect):
     test = staticmethod(nonlinear_feedback)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
-        """Static layers that see the last dynamic layer and act back on it.
+        """Static layers that see the last dynamic layer and act back on it, or a chain of them.
 
         Products come first where the test has one as its best column, and are left out where none
         gains nearly as much: refits take as long as those of functions.
@@ -170,7 +174,8 @@ class NonlinearFeedbackOfOutput(Effect):
         if share == 1.0:
             leading = [*products, *functions]
         forms = [with_forms(model), with_forms(model, hidden=True)]
-        extended = [*leading, *forms, with_feedback(model, hidden=True)]
+        chain = in_place_of(model, CHAIN)
+        extended = [*leading, *forms, chain, with_feedback(model, hidden=True)]
         return list({repr(variant): variant for variant in extended if variant}.values())
 
     def sentence(self, evidence: Evidence, model: Model) -> str:
@@ -180,6 +185,12 @@ class NonlinearFeedbackOfOutput(Effect):
         functions = {s for one in back if not is_product(one.layer) for s in one.sources}
         factors = {one.sources[-1] for one in back if is_product(one.layer)}
         y = evidence.where["output"]
+        if model.has_real_poles:
+            count = len(model.dynamic)
+            return (
+                f"'{y}' is the level of the last of {count} compartments: what flows out of one, "
+                "by a root and over an edge, enters the next."
+            )
         unseen = f"a signal of the dynamics of '{y}' that is not measured"
         hidden = {name for name in functions if name.endswith(HIDDEN)}
         said = []

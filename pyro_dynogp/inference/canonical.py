@@ -138,7 +138,9 @@ class Canonical:
             if layer.integrators:  # one of each signal, between real and imaginary parts of pairs
                 levels = layer.pairs + places[f"{wire.name}_output"]
             imaginary = layer.pairs + len(levels) + pairs
-            places[wire.dims["state"]] = torch.cat([pairs, levels, imaginary])
+            places[wire.dims["state"]] = torch.cat(
+                [pairs, levels] if layer.real else [pairs, levels, imaginary]
+            )
         return {dim: own for dim, own in places.items() if len(own)}
 
     @property

@@ -47,9 +47,9 @@ SAME_STEPS, ADAM_STEPS, SVI_STEPS = 300, 200, 400
 # Iterations of extended models: linear, others of the same layers, with a layer more.
 LINEAR_STEPS, LAYERED_STEPS = 100, 100
 ADDED_STEPS: Mapping[str, int] = MappingProxyType({"gauss-newton": 60, "lbfgs": 300, "adam": 300})
-# Starts from linear fits of its own that a model with a layer more has beside what is learnt, and
-# iterations of those fits.
-FRESH, FRESH_STEPS = 4, 40
+# Starts from linear fits of its own that a model with a layer more has beside what is learnt, those
+# of one whose dynamics take the place of what is learnt, and iterations of those fits.
+FRESH, REPLACED, FRESH_STEPS = 4, 12, 40
 # Of the same model every start goes on, near its optimum; of a linear one that is extended half of
 # them do, side by side, as processors are kept busy by other trials. With feedback all go on: after
 # few iterations their order says little (of nine plants two chose a start 180 nats below another).
@@ -250,6 +250,7 @@ def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     that reports a size) the linear fit is any of several poor optima: such a model starts from
     linear fits of its own, too; a function in feedback from what is learnt, where nothing comes
     back as yet.
+    Real poles in place of pairs are other dynamics: nothing that is learnt goes over to them.
 
     A linear model with more poles has the starts of a first fit, too: what is new may take the
     place of what is learnt.
@@ -259,6 +260,11 @@ def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     variants are compared: their order is the same without.
     """
     target, records = problem.target, problem.records
+    if target.has_real_poles and not fit.model.has_real_poles:
+        fresh = starting_points(target, records, run, count=REPLACED, steps=FRESH_STEPS)
+        optimizer = optimizer_for(target)
+        return climb(target, records, fresh, [], run, optimizer=optimizer,
+                     steps=run.steps or ADDED_STEPS[optimizer])  # fmt: skip
     starts, new = extended_starts(fit, problem.model, records, run.seed)
     effort = LOOPED if target.has_feedback else EXTENDED
 

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.layers.sites import Values
+from pyro_dynogp.models.gains import unit_direction
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.priors import unit_direction
 from pyro_dynogp.models.wiring import Dynamic
 
 

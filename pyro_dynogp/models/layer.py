@@ -44,6 +44,8 @@ class Dynamic:
             computed anew. With 1 they are held from sample to sample, which is too long for one
             that changes faster (friction of a mass that stops between two samples); the work grows
             with their number. Not beside dead times that are parameters.
+        real: whether poles are real, `pairs` of them in place of pairs: first-order lags. Of one
+            signal, in a cascade with static layers, without integrators.
         name: prefix of its sites; g, or g1, g2, ... by default.
 
     Examples:
@@ -64,6 +66,7 @@ class Dynamic:
     feedback: tuple[str, ...] = ()
     hidden: int = 0
     substeps: int = 1
+    real: bool = False
     name: str | None = None
 
     @property
@@ -80,10 +83,11 @@ class Dynamic:
     def past_states(self) -> tuple[int, ...]:
         """Entries of [Re x; Im x] that inputs before a record can have moved.
 
-        That of an integrator is real, and its random walk has no input.
+        That of an integrator is real, and its random walk has no input; that of a real pole is.
         """
         real = self.pairs + self.integrators * self.width
-        return (*range(real), *range(self.modes, self.modes + self.pairs))
+        imaginary = 0 if self.real else self.pairs
+        return (*range(real), *range(self.modes, self.modes + imaginary))
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from pyro_dynogp.models.explicit import observe_explicit
 from pyro_dynogp.models.known import known_function, known_sites
 from pyro_dynogp.models.limits import at_limits, log_probability_scale, scaled_limits
 from pyro_dynogp.models.outputs import output_process
-from pyro_dynogp.models.past_inputs import past_input_covariance
+from pyro_dynogp.models.past_inputs import first_levels, past_input_covariance
 from pyro_dynogp.models.prepared import PreparedRecord, Records
 from pyro_dynogp.models.priors import FLAT, ModesPrior, direct_site
 from pyro_dynogp.models.structure import Structure
@@ -177,6 +177,8 @@ class Model(Structure):
         """One dynamic layer at values of its sites."""
         modes = self._modes_prior(place, layer, scaling).modes(values)
         memory = 1.0 / TimeScale.of(scaling).typical_rate
+        if layer.real:
+            return DynamicSystem(modes, first_levels(modes))
         if place.fed and place.channels:
             return DynamicSystem(modes, past_input_covariance(modes, memory, place.channels))
         return DynamicSystem(modes, memory)
@@ -221,6 +223,7 @@ class Model(Structure):
             integrators=layer.integrators,
             late=tuple(column for column in columns if column < place.channels),
             reference=self.reference_of(layer, scaling),
+            real=layer.real,
         )
 
     def static_prior(

@@ -10,7 +10,8 @@ from torch import Tensor
 from pyro_dynogp.lti.covariance import real_covariance
 from pyro_dynogp.lti.modes import Modes
 
-# Standard deviation of the level of an integrator at the first sample, in those of the outputs.
+# Standard deviation of the level of an integrator, or of a real pole in feedback, at the first
+# sample: in those of the outputs.
 LEVEL = 3.0
 
 
@@ -36,6 +37,16 @@ def past_input_covariance(modes: Modes, memory: float, inputs: int | None = None
     symmetric = held @ held.mT - 2.0 * memory * (B @ B.mT) / (lam.unsqueeze(-1) + lam.unsqueeze(-2))
     covariance = real_covariance(hermitian, symmetric)
     return covariance + levels if bool(integrates.any()) else covariance
+
+
+def first_levels(modes: Modes) -> Tensor:
+    """Covariance (*b, 2P, 2P) of [Re x; Im x] of real poles in feedback: levels 2 x of any past.
+
+    What came back before the record is as unknown as its inputs, and held a level that hardly
+    decays by itself: its standard deviation is `LEVEL`, as that of an integrator.
+    """
+    level = torch.full_like(modes.poles.real, (0.5 * LEVEL) ** 2)
+    return torch.diag_embed(torch.cat([level, torch.zeros_like(level)], -1))
 
 
 def initial_mean(covariance: Tensor, standard: Tensor) -> Tensor:

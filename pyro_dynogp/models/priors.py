@@ -32,7 +32,7 @@ from pyro_dynogp.distributions.decay import LogDecayRate
 from pyro_dynogp.distributions.shared_scale import SharedScaleNormal
 from pyro_dynogp.layers.sites import Site, Values, sample
 from pyro_dynogp.lti.modes import Modes, NoiseStructure
-from pyro_dynogp.lti.views import residues
+from pyro_dynogp.models.gains import input_gains, noise_gains, unit_direction
 from pyro_dynogp.models.horseshoe import horseshoe, horseshoe_sites
 from pyro_dynogp.support.errors import instance, invalid, verify_fields
 from pyro_dynogp.support.tensors import at_places, joined
@@ -46,6 +46,8 @@ CRITICAL = 0.02
 # Decay rates below this many per record are unlikely a priori: in 1/SETTLING of the record such a
 # mode has decayed to a third.
 SETTLING = 10.0
+# The same of real poles, which have feedback.
+LASTING = 0.1
 # Standard deviation of a prior that is flat for all practical purposes.
 FLAT = 1e3
 # Of the random walk beside an integrator: its rate, per record, and how far it gets within one, in
@@ -117,6 +119,10 @@ class ModesPrior:
         gain_scale: of the gains of an input a priori.
         priors: "default", or "paper" for flat ones but for the horseshoe.
         reference: the output whose entries of c are positive, where there are several.
+        real: whether there are P real poles in place of pairs, of a single output. There are no
+            frequencies then, and one number g for each gain: G_j(s) = g r / (s - lambda), r the
+            typical rate. What comes back decides how fast a level settles: such a pole may be as
+            slow as an integrator (`LASTING`).
 
     Raises:
         ValueError: on unknown priors, or a record of three samples or fewer.
@@ -137,6 +143,7 @@ class ModesPrior:
     integrators: int = 0
     late: tuple[int, ...] = ()
     reference: int = 0
+    real: bool = False
 
     def __post_init__(self) -> None:
         verify_fields(self)
@@ -157,14 +164,16 @@ class ModesPrior:
         def named(*generic: str) -> tuple[str, ...]:
             return tuple(dims.get(dim, dim) for dim in generic)
 
-        name, P, n_u = self.name, self.pairs, self.inputs
+        name, P, n_u, terms = self.name, self.pairs, self.inputs, 1 if self.real else 2
         flat, wide = self.priors == "paper", self.time_scale.brevity
         sites = [*self._pole_sites(named("pair"))]
         if n_u:
             gain = (
-                _normal(FLAT, P, n_u, 2)
+                _normal(FLAT, P, n_u, terms)
                 if flat
-                else SharedScaleNormal(GAIN_FREEDOM, wide * self.gain_scale, (P, n_u, 2), apart=1)
+                else SharedScaleNormal(
+                    GAIN_FREEDOM, wide * self.gain_scale, (P, n_u, terms), apart=1
+                )
             )
             over = named("pair", "input", "term")
             sites.append(Site(f"{name}_input_gain", gain, over, growth=0.0))
@@ -180,7 +189,7 @@ class ModesPrior:
             # The sign of a Brownian motion, and of a zero, cannot be seen in a covariance.
             single = self.pairs + self.integrators == 1 or self.noise == "independent"
             sites += horseshoe_sites(
-                f"{name}_noise_gain", P, self.brownian, 2,
+                f"{name}_noise_gain", P, self.brownian, terms,
                 dims=named("pair", "brownian", "term"),
                 positive=self.outputs is None and self.brownian == 1 and single,
                 growth=QUIET,
@@ -206,38 +215,42 @@ class ModesPrior:
         """Columns of inputs with a direct path, where there is any."""
         return [column for column in range(self.inputs - self.fed) if column not in self.late]
 
-    def _pole_sites(self, dims: tuple[str, ...]) -> tuple[Site, Site]:
+    def _pole_sites(self, dims: tuple[str, ...]) -> tuple[Site, ...]:
         low, high = self.time_scale.rate_bounds
         if self.priors == "paper":
             decay = frequency = _normal(FLAT, self.pairs)
         else:
             half = 0.5 * (high - low)
             top = torch.full((self.pairs,), half, dtype=torch.float64)
-            settling = torch.full_like(top, SETTLING / self.time_scale.brevity / math.exp(half))
+            least = (LASTING if self.real else SETTLING) / self.time_scale.brevity
+            settling = torch.full_like(top, least / math.exp(half))
             decay = LogDecayRate(settling, top).to_event(1)
             bottom = torch.full_like(top, -half - math.log(10.0))
             frequency = dist.Uniform(bottom, top).to_event(1)
-        return (
+        sites = (
             Site(f"{self.name}_log_decay", decay, dims),
             Site(f"{self.name}_log_frequency", frequency, dims),
         )
+        return sites[:1] if self.real else sites
 
     def modes(self, values: Values) -> Modes:
         """Poles and gains at values (*b, *shape) of the sites; batch shape *b."""
         name = self.name
         rate = self.time_scale.typical_rate
         decay = rate * values[f"{name}_log_decay"].exp()
-        undamped = rate * values[f"{name}_log_frequency"].exp()
-        # The floor is as good as a double real pole (relative error 4e-4); residues stay finite.
-        frequency = (undamped.square() + (CRITICAL * decay).square()).sqrt()
+        frequency = torch.zeros_like(decay)
+        if not self.real:
+            undamped = rate * values[f"{name}_log_frequency"].exp()
+            # As good as a double real pole (relative error 4e-4), and residues stay finite.
+            frequency = (undamped.square() + (CRITICAL * decay).square()).sqrt()
         poles = torch.complex(-decay, frequency)
         B = L = drift = None
         if self.inputs:
             gain = values[f"{name}_input_gain"]
-            B = residues(poles, _section(poles, gain) * poles.abs()[..., None, None])
+            B = input_gains(poles, gain, rate)
         if self.process_noise:
             share = horseshoe(f"{name}_noise_gain", values, 3)
-            L = residues(poles, _section(poles, share) * math.sqrt(4.0 * rate))
+            L = noise_gains(poles, share, rate)
         if self.outputs is None:
             c = torch.ones(self.pairs, dtype=torch.complex128)
             c = c.expand(poles.shape)
@@ -313,16 +326,3 @@ def direct_site(columns: int, outputs: int, *, flat: bool = False) -> Site:
     """Weights (n_y, K) of inputs that act on the output at once, site ``direct``."""
     prior = _normal(FLAT if flat else 1.0, outputs, columns)
     return Site("direct", prior, ("output", "direct input"), growth=0.0)
-
-
-def _section(poles: Tensor, gain: Tensor) -> Tensor:
-    """(g1, g0) to the numerator (g1, g0 |lambda|)."""
-    size = poles.abs().unsqueeze(-1)
-    return torch.stack(torch.broadcast_tensors(gain[..., 0], gain[..., 1] * size), -1)
-
-
-def unit_direction(raw: Tensor, reference: int = 0) -> Tensor:
-    """Columns of raw (*b, n_y, P) of unit length, their entry `reference` real, positive."""
-    first = raw[..., reference : reference + 1, :]
-    turned = raw * (first.conj() / first.abs())
-    return turned / raw.abs().square().sum(-2, keepdim=True).sqrt()

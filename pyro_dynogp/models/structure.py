@@ -87,6 +87,13 @@ class Structure:
         whole(count_direct(self.channels), self.inputs).check("direct", self.direct)
         free_delays(self.channels)  # refuses what is made from them
         end = self.output_wire.layer  # placing the layers refuses those that do not fit together
+        if self.is_linear and isinstance(end, Dynamic) and end.real:
+            raise invalid(
+                f"real of layer {self.wires[0].name!r}",
+                expected="False in a model without static layers",
+                got="True",
+                advice="Pairs can have real poles as well.",
+            )
         if self.has_feedback:
             _check_feedback(self.integrate, self.likelihood)
         if self.late and self.substeps > 1:
@@ -135,6 +142,11 @@ class Structure:
     def has_feedback(self) -> bool:
         """Whether a static layer's output comes back to an earlier layer."""
         return any(w.feedback for w in self.wires)
+
+    @property
+    def has_real_poles(self) -> bool:
+        """Whether a dynamic layer has real poles in place of pairs."""
+        return any(isinstance(layer, Dynamic) and layer.real for layer in self.layers)
 
     @property
     def substeps(self) -> int:

@@ -117,11 +117,14 @@ def with_pairs(model: Model, count: int) -> Model:
 
 
 def with_integrator(model: Model) -> Model | None:
-    """The model with a pole at zero in its last dynamic layer; None where there is one, or none."""
+    """The model with a pole at zero in its last dynamic layer.
+
+    None where there is one already or no such layer, and beside real poles.
+    """
     if not model.dynamic or not model.dynamic[-1][0].channels:
         return None
     last = model.dynamic[-1][0].name
-    if any(layer.integrators for _, layer in model.dynamic):
+    if model.has_real_poles or any(layer.integrators for _, layer in model.dynamic):
         return None
     return with_dynamics(
         model, lambda wire, layer: replace(layer, integrators=1) if wire.name == last else layer
@@ -257,7 +260,7 @@ def _fed_back(model: Model, given: Sequence[Static | Known], *, hidden: bool) ->
         hidden: whether one sees a signal that nothing measures.
     """
     noise, (seen, layer) = model.likelihood, model.dynamic[-1]
-    if noise.follows_output or not noise.gaussian:
+    if noise.follows_output or not noise.gaussian or (hidden and layer.real):
         return None
     sources = {wire.name: wire.sources for wire in model.wires}
     before = {sources[name] for name in layer.feedback}

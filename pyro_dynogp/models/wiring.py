@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from numbers import Real
+from dataclasses import dataclass, replace
 
-from pyro_dynogp.layers.kernels import KernelPrior
 from pyro_dynogp.models.layer import Dynamic as Dynamic
 from pyro_dynogp.models.layer import Known as Known
 from pyro_dynogp.models.layer import Layer as Layer
 from pyro_dynogp.models.layer import Limits as Limits
 from pyro_dynogp.models.layer import Static as Static
 from pyro_dynogp.models.layer import StaticLayer as StaticLayer
-from pyro_dynogp.models.layer import in_double
-from pyro_dynogp.models.product import factors
-from pyro_dynogp.support.errors import COUNT, RULES, instance, invalid, whole
+from pyro_dynogp.models.layer_rules import check_layer, check_limits, check_product
+from pyro_dynogp.support.errors import instance, invalid, whole
 
 INPUTS = "inputs"
 # What follows a layer's name in that of its hidden signals.
@@ -100,7 +96,7 @@ def wire(inputs: int, layers: Sequence[Layer], output: str | None = None) -> tup
     _check_feedback(names, layers)
     widths = {name: layer.outputs for name, layer in zip(names, layers, strict=True)}
     for name, layer in zip(names, layers, strict=True):
-        _check_layer(name, layer)
+        check_layer(name, layer)
     back = {source for layer in layers if isinstance(layer, Dynamic) for source in layer.feedback}
     width = {INPUTS: inputs}
     wires: list[Wire] = []
@@ -113,14 +109,14 @@ def wire(inputs: int, layers: Sequence[Layer], output: str | None = None) -> tup
             raise invalid(
                 f"layer {name!r}", expected="inputs for a static layer", got="no channels"
             )
-        _check_product(name, layer, channels)
+        check_product(name, layer, channels)
         if isinstance(layer, Static):
             looped = name in back and channels > 1
             linear = place == 0 or looped or layer.limits is not None
             layer = replace(layer, mean=layer.mean or ("linear" if linear else "constant"))
             if layer.limits is not None:
                 end = name == output == names[-1] and name not in back
-                _check_limits(name, layer, channels, end)
+                check_limits(name, layer, channels, end)
         elif (
             isinstance(layer, Dynamic)
             and channels == 0
@@ -254,66 +250,6 @@ def _check_hidden(wires: Sequence[Wire]) -> None:
                 expected=f"0, or a function that sees {w.name + HIDDEN!r} in a layer with feedback",
                 got=repr(_hidden(w.layer)),
             )
-
-
-def _check_layer(name: str, layer: Layer) -> None:
-    for option in fields(layer):
-        value = getattr(layer, option.name)
-        if option.name in RULES and not (value is None and option.default is None):
-            RULES[option.name].check(f"{option.name} of layer {name!r}", value)
-    if isinstance(layer, Static):
-        COUNT.check(f"support of layer {name!r}", layer.support)
-        # Refuses what is no kernel of one function.
-        KernelPrior(name, layer.kernel, 1, layer.smoothness)
-    elif isinstance(layer, Known):
-        _check_known(name, layer)
-
-
-def _check_known(name: str, layer: Known) -> None:
-    if not callable(layer.function):
-        got = repr(layer.function)
-        raise invalid(f"function of layer {name!r}", expected="a function of torch", got=got)
-    instance(f"parameters of layer {name!r}", layer.parameters, Mapping)
-    for parameter, prior in layer.parameters.items():
-        instance(f"parameters of layer {name!r}: a name", parameter, str)
-        in_double(prior, f"parameters of layer {name!r}: {parameter}")
-    ends = (0.0, 1.0) if layer.range is None else layer.range
-    numbers = isinstance(ends, tuple | list) and all(isinstance(end, Real) for end in ends)
-    if not (numbers and len(ends) == 2 and ends[0] < ends[1]):
-        raise invalid(
-            f"range of layer {name!r}", expected="(low, high) with low < high", got=repr(ends)
-        )
-
-
-def _check_product(name: str, layer: Layer, channels: int) -> None:
-    """Refuse a product of another number of signals than it sees."""
-    first = factors(layer)
-    if first and channels != first + layer.outputs // first:
-        raise invalid(
-            f"layer {name!r}",
-            expected=f"{first} signals that come first and {layer.outputs // first} others",
-            got=f"{channels} signals",
-        )
-
-
-def _check_limits(name: str, layer: Static, channels: int, last: bool) -> None:
-    assert layer.limits is not None
-    limits = layer.limits if isinstance(layer.limits, tuple | list) else ()
-    known = [limit for limit in limits if limit is not None]
-    numbers = all(isinstance(limit, Real) and not math.isnan(limit) for limit in known)
-    if len(limits) != 2 or not known or not numbers or known != sorted(set(known)):
-        raise invalid(
-            f"limits of layer {name!r}",
-            expected="(low, high) with low < high; None for one that is not there",
-            got=repr(layer.limits),
-        )
-    if not last or layer.mean != "linear" or (channels, layer.outputs) != (1, 1):
-        raise invalid(
-            f"limits of layer {name!r}",
-            expected="a last layer with a linear mean, of one signal, one output, not fed back",
-            got=f"mean {layer.mean!r}, {channels} signals, {layer.outputs} outputs"
-            + ("" if last else ", not the last layer, or fed back"),
-        )
 
 
 def _check_substeps(wires: Sequence[Wire]) -> None:

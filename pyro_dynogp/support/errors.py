@@ -130,7 +130,7 @@ RULES = {
     **dict.fromkeys(("restarts", "prior_samples", "refits", "channel", "inputs", "fed",
                      "hidden"), NUMBER),
     **dict.fromkeys(("progress", "forecasts", "process_noise", "feedthrough", "learn_locations",
-                     "pathwise", "scaled"), SWITCH),
+                     "pathwise", "scaled", "real"), SWITCH),
     "seed": Rule("a whole number from 0 to 2**63 - 1", whole(0, 2**63 - 1).plain),
     "level": SHARE,
     "least_lengthscale": POSITIVE_OR_ZERO,

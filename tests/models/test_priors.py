@@ -10,7 +10,8 @@ import torch
 import pyro_dynogp as dgp
 from pyro_dynogp.data.scaling import TimeScale
 from pyro_dynogp.lti.views import frequency_response, numerators, residues, steady_state_gain
-from pyro_dynogp.models.priors import CRITICAL, SETTLING, sample_modes, unit_direction
+from pyro_dynogp.models.gains import unit_direction
+from pyro_dynogp.models.priors import CRITICAL, SETTLING, sample_modes
 
 TYPICAL = TimeScale(1.0, 1000.0).typical_rate  # of the default time scale
 

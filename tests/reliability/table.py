@@ -220,6 +220,8 @@ TABLE: dict[str, Entry] = {
                                 "step": ("yes", 2, 0.5, [True]), "parametric": SWITCH,
                                 "substeps": (*COUNT, 65)},
                                inputs=1),
+    "Compartments": plain(dgp.Compartments, {"inputs": NUMBER, "count": COUNT,
+                          "process_noise": SWITCH, "substeps": (*COUNT, 65), **OPTIONS}, inputs=1),
     "ParallelWienerHammerstein": plain(dgp.ParallelWienerHammerstein,
                                        {**CURVED, "branches": (*COUNT, None)}, inputs=1, pairs=1),
     "Cascade": plain(dgp.Cascade, {"inputs": NUMBER, "layers": ((), ["g"], [3], "g", None),
@@ -234,7 +236,8 @@ TABLE: dict[str, Entry] = {
         "outputs": COUNT, "pairs": COUNT, "noise": NAME, "brownian": COUNT, "feedthrough": SWITCH,
         "process_noise": SWITCH, "integrators": BOTH, "skip": (("g",), "inputs", 3),
         "sees": (("g",), "inputs", 3), "feedback": (("f",), "f", 3), "hidden": (*NUMBER, 1),
-        "substeps": (*COUNT, 2, None), "name": ("y", "inputs", 3, "a b")}),
+        "substeps": (*COUNT, 2, None), "real": (*SWITCH, True),
+        "name": ("y", "inputs", 3, "a b")}),
     "Static": plain(of_model(dgp.Static), {
         "outputs": COUNT, "inducing": COUNT, "kernel": KERNEL, "mean": NAME,
         "limits": ((1.0, 0.0), (None, None), (0.0,), 3, "ab", (np.nan, 1.0)),

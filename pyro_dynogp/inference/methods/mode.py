@@ -203,8 +203,8 @@ def cascade_optima(problem: Problem, run: Run, optimizer: Optimizer, steps: int)
     left out. Where none remains there is another set of starts, and then a warning.
     """
     model, records, learnt = problem.target, problem.records, problem.learnt
-    hidden = any(layer.hidden for _, layer in model.dynamic)
-    several = LOOPED if model.has_feedback and not hidden else CURVED
+    unseen = model.has_real_poles or any(layer.hidden for _, layer in model.dynamic)
+    several = LOOPED if model.has_feedback and not unseen else CURVED
     usual = several if model.has_function else RANDOM
     optima: list[Optimum] = []
     least = math.inf

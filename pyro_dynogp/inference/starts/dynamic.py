@@ -15,7 +15,7 @@ from pyro_dynogp.layers.functions import in_place
 from pyro_dynogp.models.arrival import prompt_columns
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord
-from pyro_dynogp.models.wiring import Dynamic, Known, Wire
+from pyro_dynogp.models.wiring import INPUTS, Dynamic, Known, Wire
 from pyro_dynogp.support.tensors import at_places
 
 Values = dict[str, Tensor]
@@ -25,6 +25,9 @@ SMALL = 0.05
 INTEGRATORS = ("integrator_gain", "integrator_drift", "integrator_noise")
 # Standard deviation of the logarithms by which poles are moved for a layer beside another.
 MOVED = 0.5
+# Of layers with real poles: the share of a level's decay that is not by feedback, and standard
+# deviations of the logarithms of rates and gains.
+UNFED, RATES, GAINS = 0.5, 0.5, 0.3
 
 
 def with_late_inputs(direct: Tensor, model: Model, scaling: Scaling, count: int) -> Tensor:
@@ -218,6 +221,33 @@ class DynamicStart:
             values.update(self._small_noise())
         return values
 
+    def lags(self, linear: Mapping[str, Tensor] | None) -> Values:
+        """Real poles: levels that all they see raises, and all that comes back lowers.
+
+        Rates are around those of a linear fit, and inputs of the model have the signs of its
+        steady-state gains; all at random, as there is no best guess.
+        """
+        layer, d, rate = self.layer, self.one.channels, TimeScale.of(self.scaling).typical_rate
+        sizes = torch.tensor(np.abs(random_poles(layer.pairs, self.scaling, self.generator)) / rate)
+        signs = torch.ones(d, dtype=torch.float64)
+        if linear is not None:
+            sizes = torch.complex(*(linear[f"g_log_{x}"].exp() for x in ("decay", "frequency")))
+            sizes = sizes.abs()
+            if self.one.sources == (INPUTS,) and "g_input_gain" in linear:
+                signs = torch.where(linear["g_input_gain"][..., 1].sum(0) < 0.0, -1.0, signs)
+        signs = torch.cat([signs, signs.new_full((self.one.fed,), UNFED - 1.0)]) / UNFED
+        decay = sizes.log() + np.log(UNFED) + self._random(layer.pairs, scale=RATES)
+        own = self._random(layer.pairs, len(signs), scale=GAINS).exp() / layer.pairs
+        own = own * decay.exp()[:, None]
+        values = {
+            self._key("log_decay"): decay,
+            self._key("input_gain"): (in_place(own, self._inputs) * signs).unsqueeze(-1),
+        }
+        direct = self._direct_shape()
+        if direct is not None:
+            values[self._key("feedthrough")] = torch.zeros(direct, dtype=torch.float64)
+        return values | (self._small_noise() if layer.process_noise else {})
+
     def _direct_shape(self) -> torch.Size | None:
         """Shape of the site of direct paths; None where there is none."""
         sites = self.model.sites(self.scaling)
@@ -230,7 +260,9 @@ class DynamicStart:
         return {
             **(walk if layer.integrators else {}),
             self._key("noise_gain_local_scale"): torch.full((layer.pairs,), 0.5).double(),
-            self._key("noise_gain_unit"): self._random(layer.pairs, count, 2, scale=0.3).abs()
+            self._key("noise_gain_unit"): self._random(
+                layer.pairs, count, 1 if layer.real else 2, scale=0.3
+            ).abs()
             + 0.05,
         }
 
@@ -242,7 +274,12 @@ class DynamicStart:
             return layer.mean(torch.cat([x, silent], -1), record.grid)
 
     def scale(self, values: Values, factor: float) -> None:
-        """Multiply the layer's output."""
+        """Multiply the layer's output; of real poles what it sees, where functions come back."""
+        if self.layer.real:
+            seen = torch.arange(self.one.channels)
+            gain = values[self._key("input_gain")]
+            values[self._key("input_gain")] = gain.index_copy(1, seen, factor * gain[:, seen])
+            return
         for name in ("input_gain", "feedthrough", "noise_gain_unit", *INTEGRATORS):
             if self._key(name) in values:
                 values[self._key(name)] = values[self._key(name)] * factor

@@ -112,7 +112,9 @@ def starting_point(model: Model, records: Sequence[PreparedRecord], plan: Plan) 
         seen = [see(s, one) for s in signals]
         if isinstance(one.layer, Dynamic):
             start = DynamicStart(model, one, one.layer, scaling, generator)
-            if one.name == plan.leading and plan.linear is not None:
+            if one.layer.real:
+                values.update(start.lags(plan.linear))
+            elif one.name == plan.leading and plan.linear is not None:
                 values.update(start.from_linear(plan.linear, ahead=plan.ahead))
             elif plan.linear is not None and _beside(model, one, plan.leading):
                 values.update(start.from_linear(plan.linear, moved=True))
@@ -120,7 +122,8 @@ def starting_point(model: Model, records: Sequence[PreparedRecord], plan: Plan) 
                 values.update(start.near_identity())
             outputs = [start.response(values, r, x) for r, x in zip(records, seen, strict=True)]
             factor = size
-            if one.name != model.measured_signal:  # unit scale for the layer above
+            # Unit scale for the layer above, and of what does not begin at the linear fit.
+            if one.name != model.measured_signal or one.layer.real:
                 factor = 1.0 / max(float(torch.cat(outputs).std()), 1e-6)
                 size = size / factor
             start.scale(values, factor)
@@ -200,7 +203,8 @@ def _linear_state(
     """Standard normal numbers of the first state that the linear fit finds by smoothing."""
     layer = one.layer
     assert isinstance(layer, Dynamic)
-    other = layer.hidden and layer.integrators  # states that the linear fit has not
+    # States that the linear fit has not.
+    other = layer.real or (layer.hidden and layer.integrators)
     if layer.outputs != model.outputs or not one.channels or other:
         return torch.zeros(len(layer.past_states), dtype=torch.float64)
     noisy = "g_noise_gain_unit" in linear
