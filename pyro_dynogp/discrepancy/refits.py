@@ -156,13 +156,15 @@ class Refits:
 
         Where most of a gain comes from a few stretches of a short block its error is as large, of
         whatever is right; the residual is certain (see `unsure`) and evidence is very strong.
+        Parametric functions in feedback need gain nothing for certain, as long as they gain:
+        they have few numbers, which short blocks tell too little of, and evidence is worth more.
         """
         level = min(level, self.settings.unsure)
         if any(one.helps for one in judged):
             return list(judged)
         return [
             self._weighed(one, True)
-            if one.attempt.decision == "nearly" and one.found.q_value <= level
+            if _may_be_weighed(one) and one.found.q_value <= level
             and one.tried.fit is not None and self.evidence(one) > VERY_STRONG
             else one
             for one in judged
@@ -278,3 +280,10 @@ class Refits:
         attempt, effect = one.attempt, one.found.effect
         stiff = not one.tried.model.has_function and effect.acts_on == "inputs"
         return stiff and attempt.gain > -self.settings.standard_errors * attempt.gain_error
+
+
+def _may_be_weighed(one: Judged) -> bool:
+    """Whether a candidate nearly helps, or gains and has parametric functions in feedback."""
+    model, attempt = one.tried.model, one.attempt
+    parametric = model.learns_function and not model.has_gaussian_process
+    return attempt.decision == "nearly" or (parametric and not one.harms and attempt.gain > 0.0)

@@ -255,6 +255,29 @@ def test_what_nearly_helps_is_settled_by_the_evidence_of_all_known_data(
     assert refits(NOTHING).by_evidence([unfitted], 0.05) == [unfitted]
 
 
+@pytest.mark.parametrize(
+    ("model", "gain", "helps"),
+    [
+        (dgp.Compartments(1), 0.1, True),
+        (dgp.NonlinearFeedback(1, parametric=True), 0.1, True),
+        (dgp.Compartments(1), -0.1, False),  # held-out data speak against it
+        (dgp.NonlinearFeedback(1), 0.1, False),  # a Gaussian process has many numbers
+        (dgp.LinearDynamicGP(1), 0.1, False),
+    ],
+)
+def test_parametric_functions_in_feedback_are_settled_by_evidence_where_they_gain(
+    monkeypatch: pytest.MonkeyPatch, model: dgp.Model, gain: float, helps: bool
+) -> None:
+    monkeypatch.setattr(Refits, "evidence", lambda self, one: VERY_STRONG + 0.1)
+    fit: Any = object()
+    one = candidate(INPUT, gain, 10.0, q=1e-4)
+    one = replace(one, tried=replace(one.tried, fit=fit, model=model))
+    (found,) = refits(NOTHING).by_evidence([one], 0.05)
+    assert found.helps is helps
+    worse = replace(one, harms=True)  # its forecasts are certainly worse
+    assert refits(NOTHING).by_evidence([worse], 0.05) == [worse]
+
+
 def test_noise_that_nearly_helps_is_settled_so_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the candidates of a round those of the noise come after the structure."""
     asked: list[list[str]] = []

@@ -158,10 +158,11 @@ class TestBlock:
             {"g": (("inputs",), forms), **dict.fromkeys(forms, output)},
             {"g": (("inputs",), more), **dict.fromkeys(more[:2], output),
              **dict.fromkeys(more[2:], hidden)},
+            {w.name: (w.sources, w.feedback) for w in dgp.Compartments(1).wires},
             {"g": (("inputs",), ("feedback", *unseen)), "feedback": output,
              **dict.fromkeys(unseen, hidden)},
         ]  # fmt: skip
-        for model in variants:
+        for model in (*variants[:6], variants[7]):
             assert model.output_wire.name == "g"
             assert model.dynamic[0][1].pairs == 2
         said = [EFFECT.sentence(SAID, model) for model in variants]
@@ -175,6 +176,8 @@ class TestBlock:
             "What the test said.",
             both := "Nonlinear functions of 'x', and of a signal of the dynamics of 'x' that is "
             "not measured, act back on them.",
+            "'x' is the level of the last of 2 compartments: what flows out of one, by a root and "
+            "over an edge, enters the next.",
             both,
         ]
 
@@ -191,7 +194,7 @@ class TestBlock:
         said = SimpleNamespace(where={"output": "x", "products": share})
         made = EFFECT.extend(dgp.LinearDynamicGP(1), said, spring)
         assert [one.dynamic[0][0].feedback[0] for one in made] == [
-            *leading, "output_root", "output_root", "feedback"
+            *leading, "output_root", "output_root", "root1", "feedback"
         ]  # fmt: skip
         assert made[-1].dynamic[0][0].feedback == (
             "feedback", "hidden_feedback", "feedback_step"
@@ -206,7 +209,7 @@ class TestBlock:
     def test_what_is_there_is_not_added_again(self, spring):
         """To a function of the output one of a hidden signal, and the other way round."""
         made = EFFECT.extend(dgp.LinearDynamicGP(1), SAID, spring)
-        first, second, product, hidden, forms, more, both = made
+        first, second, product, hidden, forms, more, chain, both = made
         back = {"feedback", "hidden_feedback", "feedback_step"}
         products = [{"feedback_product"}, {"hidden_product"}]
         of_output = {"output_root", "output_edge", "output_step"}
@@ -223,6 +226,8 @@ class TestBlock:
         for model in (more, both):
             assert len(EFFECT.extend(model, SAID, spring)) == 2  # products
         assert len(EFFECT.extend(product, SAID, spring)) == 6
+        for model in EFFECT.extend(chain, SAID, spring):  # of inputs and the level
+            assert model.dynamic[-1][0].feedback[-1] == "feedback_product"
         for model in (product, hidden):
             assert model not in EFFECT.extend(model, SAID, spring)
         own, *_ = EFFECT.extend(dgp.NonlinearFeedback(1), SAID, spring)
