@@ -37,9 +37,10 @@ LINES = 31_500
 # be tested and half-known gains of linear models (120 lines, of which tests are 90), and evidence
 # of all known data (80 lines), bands that fail on the last block (70 lines), and steps of a gain
 # and what happens shortly before a block ends (380 lines), and lengthscales that inducing values
-# resolve (70 lines), and parametric forms in feedback (160 lines).
+# resolve (70 lines), and parametric forms in feedback (160 lines), and compartments (280 lines, of
+# which tests are 200).
 # To shrink.
-LINES_TODAY = 54_200
+LINES_TODAY = 54_500
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

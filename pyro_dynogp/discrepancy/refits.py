@@ -21,7 +21,7 @@ from pyro_dynogp.inference.bayes_factor import VERY_STRONG, log_evidence_of
 from pyro_dynogp.inference.refit import refit
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.models.delays import comparable
-from pyro_dynogp.models.variants import Model
+from pyro_dynogp.models.variants import Model, without_process_noise
 from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.support.parallel import parallel_map
 
@@ -185,11 +185,16 @@ class Refits:
     def evidence(self, one: Judged) -> float:
         """Of a candidate over the model without it, both fitted to all known data [nats].
 
+        Of parametric functions both are without process noise, as forecasts are: it explains one
+        step ahead what either model lacks, and where free runs speak against it one has none.
         Minus infinity where one of them cannot be fitted to them.
         """
         assert one.tried.fit is not None
-        same = comparable(self.record, [self.model, one.tried.model], self.settings.reach)
-        pair = ((self.current, self.model), (one.tried.fit, one.tried.model))
+        models = (self.model, one.tried.model)
+        if _is_parametric(one.tried.model):
+            models = (without_process_noise(self.model), without_process_noise(one.tried.model))
+        same = comparable(self.record, models, self.settings.reach)
+        pair = tuple(zip((self.current, one.tried.fit), models, strict=True))
         for fit, model in pair:
             if (repr(model), len(same)) not in self.evidences:
                 try:
@@ -284,6 +289,10 @@ class Refits:
 
 def _may_be_weighed(one: Judged) -> bool:
     """Whether a candidate nearly helps, or gains and has parametric functions in feedback."""
-    model, attempt = one.tried.model, one.attempt
-    parametric = model.learns_function and not model.has_gaussian_process
-    return attempt.decision == "nearly" or (parametric and not one.harms and attempt.gain > 0.0)
+    gains = one.attempt.gain > 0.0 and not one.harms
+    return one.attempt.decision == "nearly" or (gains and _is_parametric(one.tried.model))
+
+
+def _is_parametric(model: Model) -> bool:
+    """Whether functions with parameters are in feedback, and none is a Gaussian process."""
+    return model.learns_function and not model.has_gaussian_process

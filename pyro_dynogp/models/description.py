@@ -60,7 +60,10 @@ def kind_of(layer: Known) -> str:
 def _layer(layer: Layer, *, fed_back: bool) -> Part:
     if isinstance(layer, Dynamic):
         noise = "process noise" if layer.process_noise else "no process noise"
-        pairs = f"{layer.pairs} pair{'s' if layer.pairs != 1 else ''} of poles"
+        plural = "s" if layer.pairs != 1 else ""
+        pairs = f"{layer.pairs} pair{plural} of poles"
+        if layer.real:
+            pairs = f"{layer.pairs} real pole{plural}"
         integrates = ", an integrator" if layer.integrators else ""
         return Part("dynamics", "linear dynamics", f"{pairs}{integrates}, {noise}")
     if isinstance(layer, Known):

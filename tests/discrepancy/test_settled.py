@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ import pytest
 import pyro_dynogp as dgp
 from pyro_dynogp import effects
 from pyro_dynogp.discrepancy import decision
+from pyro_dynogp.discrepancy import refits as refits_of_a_round
 from pyro_dynogp.discrepancy.decision import confirm
 from pyro_dynogp.discrepancy.judged import SPREAD, Judged, judge, kind_of
 from pyro_dynogp.discrepancy.refits import Refits
@@ -276,6 +277,32 @@ def test_parametric_functions_in_feedback_are_settled_by_evidence_where_they_gai
     assert found.helps is helps
     worse = replace(one, harms=True)  # its forecasts are certainly worse
     assert refits(NOTHING).by_evidence([worse], 0.05) == [worse]
+
+
+@pytest.mark.parametrize(
+    ("model", "noise"),
+    [(dgp.Compartments(1), False), (dgp.NonlinearFeedback(1), True), (dgp.Wiener(1), True)],
+)
+def test_evidence_of_parametric_functions_is_that_of_free_runs(
+    monkeypatch: pytest.MonkeyPatch, model: dgp.Model, noise: bool
+) -> None:
+    """Process noise explains one step ahead what either model lacks: neither has any then."""
+    asked: list[dgp.Model] = []
+
+    def refit(fit: Any, record: Any, *, model: dgp.Model, run: Any) -> dgp.Model:
+        asked.append(model)
+        return model
+
+    monkeypatch.setattr(refits_of_a_round, "refit", refit)
+    monkeypatch.setattr(refits_of_a_round, "comparable", lambda record, models, reach: record)
+    monkeypatch.setattr(refits_of_a_round, "log_evidence_of", lambda m: float(len(m.layers)))
+    one, fit = candidate(INPUT, 17.0, 10.0), cast("Any", object())
+    one = replace(one, tried=replace(one.tried, fit=fit, model=model))
+    assert refits(NOTHING).evidence(one) == len(model.layers) - 1.0
+    assert [m.layers[0].name for m in asked] == [MODEL.layers[0].name, model.layers[0].name]
+    assert [layer.process_noise for m in asked for _, layer in m.dynamic] == [noise] * (
+        1 + len(model.dynamic)
+    )
 
 
 def test_noise_that_nearly_helps_is_settled_so_as_well(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,7 @@ from pyro_dynogp.layers.sites import sample
 from pyro_dynogp.lti.covariance import stationary_variance
 from pyro_dynogp.lti.views import steady_state_gain
 from pyro_dynogp.models.compartments import in_place_of
+from pyro_dynogp.models.description import describe
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.priors import ModesPrior
 from pyro_dynogp.models.variants import with_feedback, with_forms, with_integrator, with_products
@@ -221,3 +222,8 @@ def test_units_do_not_matter_and_files_keep_it(tmp_path):
     one.save(tmp_path / "fit.json")
     again = dgp.load(tmp_path / "fit.json")
     assert again.model == one.model
+
+
+def test_its_description_says_that_poles_are_real():
+    dynamics = [part for part in describe(dgp.Compartments(1)) if part.kind == "dynamics"]
+    assert [part.details for part in dynamics] == ["1 real pole, process noise"] * 2
