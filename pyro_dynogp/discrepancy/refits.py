@@ -164,7 +164,7 @@ class Refits:
             return list(judged)
         return [
             self._weighed(one, True)
-            if _may_be_weighed(one) and one.found.q_value <= level
+            if self._may_be_weighed(one) and one.found.q_value <= level
             and one.tried.fit is not None and self.evidence(one) > VERY_STRONG
             else one
             for one in judged
@@ -191,7 +191,7 @@ class Refits:
         """
         assert one.tried.fit is not None
         models = (self.model, one.tried.model)
-        if _is_parametric(one.tried.model):
+        if self._adds_forms(one):
             models = (without_process_noise(self.model), without_process_noise(one.tried.model))
         same = comparable(self.record, models, self.settings.reach)
         pair = tuple(zip((self.current, one.tried.fit), models, strict=True))
@@ -280,17 +280,20 @@ class Refits:
 
         return [again(one) if one in unsettled else one for one in judged]
 
+    def _may_be_weighed(self, one: Judged) -> bool:
+        """Whether a candidate nearly helps, or gains and adds parametric functions in feedback."""
+        gains = one.attempt.gain > 0.0 and not one.harms
+        return one.attempt.decision == "nearly" or (gains and self._adds_forms(one))
+
+    def _adds_forms(self, one: Judged) -> bool:
+        """Whether parametric functions in feedback are what a candidate adds."""
+        return _is_parametric(one.tried.model) and not _is_parametric(self.model)
+
     def _may_lose(self, one: Judged) -> bool:
         """Whether a loss on the last block is neither certain nor one of a wrong shape."""
         attempt, effect = one.attempt, one.found.effect
         stiff = not one.tried.model.has_function and effect.acts_on == "inputs"
         return stiff and attempt.gain > -self.settings.standard_errors * attempt.gain_error
-
-
-def _may_be_weighed(one: Judged) -> bool:
-    """Whether a candidate nearly helps, or gains and has parametric functions in feedback."""
-    gains = one.attempt.gain > 0.0 and not one.harms
-    return one.attempt.decision == "nearly" or (gains and _is_parametric(one.tried.model))
 
 
 def _is_parametric(model: Model) -> bool:

@@ -185,11 +185,10 @@ class NonlinearFeedbackOfOutput(Effect):
         functions = {s for one in back if not is_product(one.layer) for s in one.sources}
         factors = {one.sources[-1] for one in back if is_product(one.layer)}
         y = evidence.where["output"]
-        if model.has_real_poles:
-            count = len(model.dynamic)
+        if model.has_real_poles and not factors:
             return (
-                f"'{y}' is the level of the last of {count} compartments: what flows out of one, "
-                "by a root and over an edge, enters the next."
+                f"'{y}' is the level of the last of {len(model.dynamic)} compartments: what flows "
+                "out of one, by a root and over an edge, enters the next."
             )
         unseen = f"a signal of the dynamics of '{y}' that is not measured"
         hidden = {name for name in functions if name.endswith(HIDDEN)}

@@ -53,7 +53,7 @@ def _slow(fit: Fitted) -> list[str]:
     unit, duration = fit.scaling.time_unit, float(fit.scaling.duration)
     found, layers = [], fit.system_at(fit.mode).dynamic
     for (wire, layer), (_, made) in zip(layers, fit.model.dynamic, strict=True):
-        if made.real:  # what comes back decides how fast its level settles
+        if made.real and made.feedback:  # what comes back decides how fast its level settles
             continue
         pole = max(layer.modes.poles[: made.pairs].tolist(), key=lambda pole: pole.real)
         held = -pole.real * duration

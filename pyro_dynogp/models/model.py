@@ -177,7 +177,7 @@ class Model(Structure):
         """One dynamic layer at values of its sites."""
         modes = self._modes_prior(place, layer, scaling).modes(values)
         memory = 1.0 / TimeScale.of(scaling).typical_rate
-        if layer.real:
+        if layer.real and place.fed:
             return DynamicSystem(modes, first_levels(modes))
         if place.fed and place.channels:
             return DynamicSystem(modes, past_input_covariance(modes, memory, place.channels))

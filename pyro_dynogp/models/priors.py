@@ -46,7 +46,7 @@ CRITICAL = 0.02
 # Decay rates below this many per record are unlikely a priori: in 1/SETTLING of the record such a
 # mode has decayed to a third.
 SETTLING = 10.0
-# The same of real poles, which have feedback.
+# The same of real poles with feedback.
 LASTING = 0.1
 # Standard deviation of a prior that is flat for all practical purposes.
 FLAT = 1e3
@@ -121,8 +121,8 @@ class ModesPrior:
         reference: the output whose entries of c are positive, where there are several.
         real: whether there are P real poles in place of pairs, of a single output. There are no
             frequencies then, and one number g for each gain: G_j(s) = g r / (s - lambda), r the
-            typical rate. What comes back decides how fast a level settles: such a pole may be as
-            slow as an integrator (`LASTING`).
+            typical rate. With feedback, which decides how fast a level settles, such a pole may be
+            as slow as an integrator (`LASTING`).
 
     Raises:
         ValueError: on unknown priors, or a record of three samples or fewer.
@@ -222,7 +222,7 @@ class ModesPrior:
         else:
             half = 0.5 * (high - low)
             top = torch.full((self.pairs,), half, dtype=torch.float64)
-            least = (LASTING if self.real else SETTLING) / self.time_scale.brevity
+            least = (LASTING if self.real and self.fed else SETTLING) / self.time_scale.brevity
             settling = torch.full_like(top, least / math.exp(half))
             decay = LogDecayRate(settling, top).to_event(1)
             bottom = torch.full_like(top, -half - math.log(10.0))

@@ -277,6 +277,9 @@ def test_parametric_functions_in_feedback_are_settled_by_evidence_where_they_gai
     assert found.helps is helps
     worse = replace(one, harms=True)  # its forecasts are certainly worse
     assert refits(NOTHING).by_evidence([worse], 0.05) == [worse]
+    there = refits(NOTHING)  # what is added is another effect
+    there.current = cast("Any", type("Current", (), {"model": dgp.Compartments(1)}))
+    assert there.by_evidence([one], 0.05) == [one]
 
 
 @pytest.mark.parametrize(

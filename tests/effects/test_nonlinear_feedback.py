@@ -228,6 +228,9 @@ class TestBlock:
         assert len(EFFECT.extend(product, SAID, spring)) == 6
         for model in EFFECT.extend(chain, SAID, spring):  # of inputs and the level
             assert model.dynamic[-1][0].feedback[-1] == "feedback_product"
+            assert EFFECT.sentence(SAID, model).endswith(
+                "Inputs times 'x' act back on its dynamics."
+            )
         for model in (product, hidden):
             assert model not in EFFECT.extend(model, SAID, spring)
         own, *_ = EFFECT.extend(dgp.NonlinearFeedback(1), SAID, spring)

@@ -7,7 +7,10 @@ import pytest
 import torch
 
 import pyro_dynogp as dgp
+from pyro_dynogp.inference import refit as refits
 from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.run import Run
+from pyro_dynogp.inference.stability import of_poles
 from pyro_dynogp.inference.starts.dynamic import RATES, UNFED
 from pyro_dynogp.inference.starts.plans import Plan, starting_point
 from pyro_dynogp.layers.sites import sample
@@ -16,8 +19,9 @@ from pyro_dynogp.lti.views import steady_state_gain
 from pyro_dynogp.models.compartments import in_place_of
 from pyro_dynogp.models.description import describe
 from pyro_dynogp.models.outputs import output_process
-from pyro_dynogp.models.priors import ModesPrior
+from pyro_dynogp.models.priors import LASTING, SETTLING, ModesPrior
 from pyro_dynogp.models.variants import with_feedback, with_forms, with_integrator, with_products
+from pyro_dynogp.support.frozen import FrozenMapping
 from tests.models.closed_loops import check_gradient, make_record, system_at
 from tests.models.test_forms import MIDDLE, PLAIN
 from tests.models.test_known import values_at
@@ -227,3 +231,42 @@ def test_units_do_not_matter_and_files_keep_it(tmp_path):
 def test_its_description_says_that_poles_are_real():
     dynamics = [part for part in describe(dgp.Compartments(1)) if part.kind == "dynamics"]
     assert [part.details for part in dynamics] == ["1 real pole, process noise"] * 2
+
+
+def test_poles_in_feedback_may_be_slow():
+    """What comes back decides how fast a level settles: no prior against it, and no warning."""
+    rates = {
+        (real, fed): ModesPrior("g", inputs=2, pairs=1, real=real, fed=fed).sites()[0].prior
+        for real in (True, False)
+        for fed in (0, 1)
+    }
+    slow = {kind: float(prior.base_dist.rate) for kind, prior in rates.items()}
+    assert slow[True, 0] == slow[False, 0] == slow[False, 1]
+    assert slow[True, 1] == pytest.approx(slow[True, 0] * LASTING / SETTLING)
+    record = make_record(n=60)
+    options = {"method": "map", "restarts": 1, "steps": 1, "workers": 1, "progress": False}
+    lag = dgp.Cascade(1, (dgp.Dynamic(pairs=1, real=True, process_noise=False), dgp.Static()))
+    for model, name, warned in ((dgp.Compartments(1), "level1", 0), (lag, "g", 1)):
+        fit = dgp.fit(model, record, **options)
+        slowest = {f"{name}_log_decay": torch.full((1,), -9.0, dtype=torch.float64)}
+        slowed = replace(fit, mode=FrozenMapping({**fit.mode, **slowest}))
+        assert len([said for said in of_poles(slowed) if "decays so slowly" in said]) == warned
+
+
+def test_refits_in_place_of_linear_dynamics_start_afresh(monkeypatch):
+    """Nothing that pairs have learnt goes over to real poles; a chain goes on from its own."""
+    record, asked = make_record(n=60), []
+    options = {"method": "map", "restarts": 1, "steps": 2, "workers": 1, "progress": False}
+    fit = dgp.fit(dgp.LinearDynamicGP(1, pairs=2), record, **options)
+    starting_points = refits.starting_points
+
+    def counted(model, records, run, *, count, steps):
+        asked.append(count)
+        return starting_points(model, records, run, count=2, steps=2)
+
+    monkeypatch.setattr(refits, "starting_points", counted)
+    run = Run(seed=0, workers=1, steps=2)
+    chain = refits.refit(fit, record, model=in_place_of(fit.model, 2), run=run)
+    assert asked == [refits.REPLACED]
+    refits.refit(chain, record[:50], model=replace(chain.model, scaling=None), run=run)
+    assert asked == [refits.REPLACED]

@@ -47,7 +47,11 @@ def extended_starts(
     sites = model.all_sites(scaling, len(records))
     dynamic = base.system_at(base.mode).dynamic
     both = zip(dynamic, base.model.dynamic, strict=True)  # poles of integrators follow the pairs
-    old = {places.get(w.name): x.modes.poles[: own.pairs].numpy() for (w, x), (_, own) in both}
+    old = {
+        places.get(w.name): x.modes.poles[: own.pairs].numpy()
+        for (w, x), (_, own) in both
+        if not own.real  # which are no pairs
+    }
     none = np.zeros(0, dtype=complex)
     if model.is_linear:
         ((wire, _),) = model.dynamic
