@@ -6,10 +6,10 @@ from dataclasses import replace
 from typing import Unpack
 
 from pyro_dynogp.layers.noise import Gaussian, Likelihood
-from pyro_dynogp.models.arrival import free_delays
 from pyro_dynogp.models.forms import Form, usual_substeps
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.structure import ModelOptions
+from pyro_dynogp.models.variants import noise_allows_feedback
 from pyro_dynogp.models.wiring import Dynamic, Layer
 from pyro_dynogp.support.errors import verify
 
@@ -58,8 +58,7 @@ def Compartments(
     """
     verify(count=count)
     if substeps is None:
-        late = bool(free_delays(options.get("channels", ())))
-        substeps = usual_substeps(forms=True, late=late)
+        substeps = usual_substeps(options.get("channels", ()), forms=True)
     layers: list[Layer] = []
     above: tuple[str, ...] = ()
     for place in range(1, count + 1):
@@ -88,12 +87,11 @@ def in_place_of(model: Model, count: int) -> Model | None:
     None for other models, several outputs, integrators, dead times that are parameters, and noise
     that feedback does not allow.
     """
-    noise = model.likelihood
     if not model.is_linear or model.outputs > 1 or model.late or model.inputs == model.direct:
         return None
     if any(layer.integrators for _, layer in model.dynamic):
         return None
-    if noise.follows_output or not noise.gaussian:
+    if not noise_allows_feedback(model):
         return None
     chain = Compartments(1, count=count)
     return replace(model, layers=chain.layers, scaling=None, output=chain.output, integrate="all")

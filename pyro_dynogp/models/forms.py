@@ -6,7 +6,7 @@ feedback.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Literal
 
@@ -15,6 +15,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
+from pyro_dynogp.data.channels import Channel
+from pyro_dynogp.models.arrival import free_delays
 from pyro_dynogp.models.layer import Known, Layer
 from pyro_dynogp.models.wiring import HIDDEN
 from pyro_dynogp.support.errors import invalid
@@ -33,9 +35,9 @@ FormName = Literal["step", "root", "edge", "cube"]
 SUBSTEPS = 3
 
 
-def usual_substeps(*, forms: bool, late: bool) -> int:
+def usual_substeps(channels: Sequence[Channel], *, forms: bool) -> int:
     """Parts of each interval where a form is in feedback; one beside free dead times."""
-    return SUBSTEPS if forms and not late else 1
+    return SUBSTEPS if forms and not free_delays(channels) else 1
 
 
 def step(x: Tensor, at: Tensor, width: Tensor) -> Tensor:

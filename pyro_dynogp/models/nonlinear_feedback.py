@@ -7,7 +7,6 @@ from typing import Unpack
 from gpytorch.kernels import Kernel
 
 from pyro_dynogp.layers.noise import Gaussian, Likelihood
-from pyro_dynogp.models.arrival import free_delays
 from pyro_dynogp.models.forms import Form, form_of, forms_of, usual_substeps
 from pyro_dynogp.models.layer import INDUCING, fed_back
 from pyro_dynogp.models.model import Model
@@ -76,8 +75,8 @@ def NonlinearFeedback(
     else:
         functions = _smooth(outputs, hidden, step, inducing, kernel)
     if substeps is None:
-        late = bool(free_delays(options.get("channels", ())))
-        substeps = usual_substeps(forms=any(map(form_of, functions)), late=late)
+        forms = any(map(form_of, functions))
+        substeps = usual_substeps(options.get("channels", ()), forms=forms)
     dynamic = Dynamic(
         outputs=outputs,
         pairs=pairs,

@@ -253,14 +253,19 @@ def with_products(model: Model, *, hidden: bool = False) -> Model | None:
     return None if extended is None else with_usual_substeps(extended)
 
 
+def noise_allows_feedback(model: Model) -> bool:
+    """Whether functions may be put in feedback beside the model's measurement noise."""
+    return model.likelihood.gaussian and not model.likelihood.follows_output
+
+
 def _fed_back(model: Model, given: Sequence[Static | Known], *, hidden: bool) -> Model | None:
     """The model with functions that act back on its last dynamic layer, but those that do.
 
     Args:
         hidden: whether one sees a signal that nothing measures.
     """
-    noise, (seen, layer) = model.likelihood, model.dynamic[-1]
-    if noise.follows_output or not noise.gaussian or (hidden and layer.real):
+    seen, layer = model.dynamic[-1]
+    if not noise_allows_feedback(model) or (hidden and layer.real):
         return None
     sources = {wire.name: wire.sources for wire in model.wires}
     before = {sources[name] for name in layer.feedback}
@@ -293,7 +298,7 @@ def with_usual_substeps(model: Model, base: Model | None = None) -> Model:
             w.name in layer.feedback and (form_of(w.layer) is not None or is_product(w.layer))
             for w in model.wires
         )
-        parts = usual_substeps(forms=forms, late=bool(model.late))
+        parts = usual_substeps(model.channels, forms=forms)
         return replace(layer, substeps=max(layer.substeps, parts))
 
     return with_dynamics(model, finer)

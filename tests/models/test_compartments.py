@@ -72,6 +72,7 @@ def test_noise_of_a_real_pole_has_the_size_of_that_of_a_pair():
         }
         modes = prior.modes(values)
         variance = stationary_variance(modes).reshape(())
+        # A pair is a double real pole up to 4e-4, see `CRITICAL`.
         assert float(variance.sqrt()) == pytest.approx(0.7, rel=1e-3)
 
 
@@ -181,6 +182,7 @@ def test_starts_have_the_signs_of_the_linear_fit():
         found += [float(start[f"level{k}_log_decay"]) for k in (1, 2)]
     expected = np.log(UNFED) - 1.0 + 0.5 * np.log(2.0)
     assert np.mean(found) == pytest.approx(expected, abs=4.0 * RATES / np.sqrt(len(found)))
+    # Of sixty normal numbers, whose standard deviation has an error of a tenth.
     assert np.std(found) == pytest.approx(RATES, rel=0.4)
 
 
