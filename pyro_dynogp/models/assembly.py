@@ -5,12 +5,13 @@ over the joint vector a = [x; f] of all modal states and all random static outpu
 through the exact mean response; only the rest is filtered. A dynamic layer that sees a trajectory
 directly (skip connections, two dynamic layers in a row) does so through an identity function, for
 which moment matching is exact. A static output that comes back to an earlier dynamic layer is held
-until the next sample, as any other that a dynamic layer sees; its known part is nothing.
+until the next sample, as any other that a dynamic layer sees; its known part is nothing. Of a
+first-order lag in feedback the next layer sees the mean over each step.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -24,27 +25,11 @@ from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import mean_response
 from pyro_dynogp.models.filter_functions import Block, functions_of, inducing_range
 from pyro_dynogp.models.known import KnownFunction
+from pyro_dynogp.models.lag_means import LagMean, has_mean, mean_of_lag
+from pyro_dynogp.models.signal import KNOWN, TRAJECTORY, Signal, places_of_outputs
 from pyro_dynogp.models.system import DynamicSystem, StaticSystem, System
-from pyro_dynogp.models.wiring import INPUTS, Dynamic, Wire
+from pyro_dynogp.models.wiring import INPUTS, Wire
 from pyro_dynogp.moments.problem import FilterProblem, make_layout
-
-# What a channel is that is no static output.
-KNOWN, TRAJECTORY = -1, -2
-
-
-@dataclass(frozen=True, eq=False)
-class Signal:
-    """A signal inside the cascade.
-
-    Attributes:
-        known: (*b, n, w) what known inputs cause.
-        rows: (*b, w, A) over [x; f], None where the signal is known altogether.
-        outputs: for each channel the static output that it is, KNOWN, or TRAJECTORY.
-    """
-
-    known: Tensor
-    rows: Tensor | None
-    outputs: tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,28 +65,6 @@ def count_states(system: System) -> int:
     return sum(2 * layer.modes.pairs for layer in layers if isinstance(layer, DynamicSystem))
 
 
-def places_of_outputs(wires: Sequence[Wire]) -> tuple[dict[str, int], int]:
-    """First place of each static layer among the random static outputs, and E, how many there are.
-
-    Identities count.
-    """
-    random: dict[str, str] = {INPUTS: "known"}
-    first: dict[str, int] = {}
-    total = 0
-    for place in wires:
-        sources = [random[name] for name in place.sources]
-        if isinstance(place.layer, Dynamic):
-            total += place.channels if "trajectory" in sources else 0
-            random |= dict.fromkeys(place.signals, "trajectory")
-        elif any(kind != "known" for kind in sources):
-            first[place.name] = total
-            total += place.layer.outputs
-            random[place.name] = "function"
-        else:
-            random[place.name] = "known"
-    return first, total
-
-
 class _Assembler:
     """Walks through the layers once; holds what has been found so far."""
 
@@ -121,6 +84,7 @@ class _Assembler:
         self.last_states: list[Tensor] = []
         self.pairs_before = 0
         self.outputs_before = 0
+        self.fed: dict[str, tuple[Modes, Tensor]] = {}  # dynamic layers, shares in their inputs
         self.extra: Tensor | None = None
 
     def expand(self, x: Tensor, event: int) -> Tensor:
@@ -179,11 +143,13 @@ class _Assembler:
     def dynamic(self, place: Wire, layer: DynamicSystem) -> dict[str, Signal]:
         seen = self.sources(place)
         known = seen.known
+        modes, means = layer.modes, dict[int, LagMean]()
         if TRAJECTORY in seen.outputs:  # a trajectory feeds the layer: hold it through an identity
-            held = self.add_block(seen, None, False)
-            seen = Signal(held.known, held.rows, held.outputs)
-            known = held.known
-        modes = layer.modes
+            means = self.means(place)
+            seen = self.add_block(seen, None, False)
+            known = seen.known
+            for channel, mean in means.items():
+                known[..., channel] = mean.known
         if place.fed:
             known = torch.cat([known, known.new_zeros((*known.shape[:-1], place.fed))], -1)
         driven = known if modes.inputs else None
@@ -192,13 +158,10 @@ class _Assembler:
         response = response if modes.several_outputs else response.unsqueeze(-1)
         self.last_states.append(self.expand(responded.state, 1))
         gain = propagators(modes, self.grid.steps)[1].unsqueeze(-1) * modes.B.unsqueeze(-3)
-        E = self.total - self.states
-        select = torch.zeros(modes.inputs, E, dtype=torch.complex128)
-        for i, o in enumerate((*seen.outputs, *self.fed_back(place))):
-            if o >= 0:
-                select[i, o] = 1.0
-        self.gains.append(self.expand(gain @ select, 3))
+        shares = self.shares((*seen.outputs, *self.fed_back(place)), means)
+        self.gains.append(self.expand(gain @ shares.to(torch.complex128), 3))
         self.modes.append(modes)
+        self.fed[place.name] = modes, shares
         covariance = layer.prior_state().covariance
         assert covariance is not None  # a prior always has one
         self.covariances.append(covariance)
@@ -212,6 +175,32 @@ class _Assembler:
             outputs = (TRAJECTORY,) * count
             found[name] = Signal(response[..., own], rows[..., own, :], outputs)
             first += count
+        return found
+
+    def means(self, place: Wire) -> dict[int, LagMean]:
+        """Channels of a layer that are means of first-order lags over each step."""
+        found, first = {}, 0
+        wires = {wire.name: wire for wire in self.system.wires}
+        for name in place.sources if self.system.has_feedback and len(self.grid.steps) else ():
+            known = self.signals[name].known
+            if name in self.fed and has_mean(wires[name], place):
+                modes, shares = self.fed[name]
+                found[first] = mean_of_lag(modes, self.grid, known[..., 0], shares)
+            first += known.shape[-1]
+        return found
+
+    def shares(self, outputs: Sequence[int], means: Mapping[int, LagMean]) -> Tensor:
+        """Share of each held static output in each input of a dynamic layer, (*b, m, n_u, E)."""
+        m = len(self.grid.steps)
+        found = torch.zeros(
+            *self.batch, m, len(outputs), self.total - self.states, dtype=torch.float64
+        )
+        for channel, output in enumerate(outputs):
+            if channel in means:
+                found[..., channel, :] = means[channel].gains
+                found[..., channel, output] += means[channel].share
+            elif output >= 0:
+                found[..., channel, output] = 1.0
         return found
 
     def fed_back(self, place: Wire) -> list[int]:
