@@ -16,7 +16,7 @@ from pyro_dynogp.discrepancy.result import Attempt
 from pyro_dynogp.discrepancy.search import Candidate, Found
 from pyro_dynogp.discrepancy.stretches import latest
 from pyro_dynogp.fitting import Fit
-from pyro_dynogp.inference.bayes_factor import VERY_STRONG, counted, log_evidence_of
+from pyro_dynogp.inference.bayes_factor import VERY_STRONG, counted, log_bayes_factor
 from pyro_dynogp.models.variants import Model
 from pyro_dynogp.statistics.settings import LoopSettings
 
@@ -177,7 +177,7 @@ def _needs_more(own: Judged, other: Judged) -> bool:
     if measured != same or more <= fewer:
         return False
     lost = min(other.attempt.gain - own.attempt.gain, 0.0)
-    return log_evidence_of(larger) - log_evidence_of(fit) + lost > VERY_STRONG
+    return log_bayes_factor(larger, fit) + lost > VERY_STRONG
 
 
 def _chosen(

@@ -255,7 +255,7 @@ def _are_noise(errors: np.ndarray, fit: Fit) -> bool:
 
 
 def _is_more_probable(one: Fit, best: Fit, gain: np.ndarray, settings: LoopSettings) -> bool:
-    """Whether training data speak for a variant, its further parameters paid for.
+    """Whether there is very strong evidence for a variant in the data that both are fitted to.
 
     Held-out data may not speak against it: neither with certainty, nor so much that little is left
     of the evidence of both. By how little held-out data differ is a matter of rounding.

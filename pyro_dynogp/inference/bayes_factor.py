@@ -1,8 +1,6 @@
-"""How far data speak for one posterior mode against another: Schwarz's criterion, and Laplace's."""
+"""How far data speak for one posterior mode against another, by Laplace's approximation."""
 
 from __future__ import annotations
-
-import math
 
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.fitted import Fitted
@@ -23,21 +21,16 @@ def counted(fit: Fitted) -> tuple[int, int]:
     return numbers, sum(int((~record.missing).sum()) for record in fit.records)
 
 
-def log_bayes_factor(one: Fitted, other: Fitted) -> float:
-    """Of one fit against another of the same data [nats]: how far these speak for it.
-
-    Its further parameters are paid for: Schwarz (Ann. Stat. 6:461, 1978), with posterior modes in
-    place of maximum likelihood.
-    """
-    (numbers, measured), (fewer, _) = counted(one), counted(other)
-    return energy(other) - energy(one) - 0.5 * (numbers - fewer) * math.log(measured)
-
-
 def log_evidence_of(fit: Fitted) -> float:
     """Log p(y) of the data that a mode is fitted to, as far as its neighbourhood goes [nats].
 
-    Schwarz's criterion pays for every inducing value of a function as for a parameter of its own,
-    which most of them are not.
+    Schwarz's criterion would pay for every inducing value of a function as for a parameter of its
+    own, which most of them are not.
     """
     model = fit.model.collapsed
     return log_evidence(Potential(model, (model.prepare(fit.records),), fit.mode), fit.mode)
+
+
+def log_bayes_factor(one: Fitted, other: Fitted) -> float:
+    """Of one fit against another of the same data [nats]: how far these speak for it."""
+    return log_evidence_of(one) - log_evidence_of(other)

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import pyro_dynogp as dgp
+from pyro_dynogp.inference.bayes_factor import counted, log_bayes_factor
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.laplace import fisher_normal, laplace, log_evidence
 from pyro_dynogp.inference.methods.base import Problem
@@ -96,6 +97,18 @@ def test_evidence_of_functions_takes_no_hessian(monkeypatch):
     expected = -energy - 0.5 * np.log(curvature / (2.0 * math.pi)).sum()
     monkeypatch.setattr(Potential, "hessian", lambda *args, **options: pytest.fail("a Hessian"))
     assert log_evidence(potential, start) == pytest.approx(expected)
+
+
+def test_inducing_values_that_tell_nothing_are_no_parameters():
+    """Twenty more of them would cost 50 nats by Schwarz's criterion."""
+    few, many = (
+        dgp.fit(dgp.Hammerstein(1, pairs=1, inducing=inducing), LONG, method="map", restarts=2,
+                workers=1, progress=False)
+        for inducing in (10, 30)
+    )  # fmt: skip
+    assert counted(many)[0] - counted(few)[0] == 20
+    assert abs(log_bayes_factor(many, few)) < 3.0
+    assert log_bayes_factor(few, many) == pytest.approx(-log_bayes_factor(many, few))
 
 
 def test_energies_without_gradients():
