@@ -38,9 +38,10 @@ LINES = 31_500
 # of all known data (80 lines), bands that fail on the last block (70 lines), and steps of a gain
 # and what happens shortly before a block ends (380 lines), and lengthscales that inducing values
 # resolve (70 lines), and parametric forms in feedback (160 lines), and compartments (280 lines, of
-# which tests are 200).
+# which tests are 200), and means of levels over steps, and products of inputs beside those of the
+# output (240 lines).
 # To shrink.
-LINES_TODAY = 54_500
+LINES_TODAY = 54_900
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,11 +10,12 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.criticism.posterior_draws import draws_of
-from pyro_dynogp.data.channels import prepared
+from pyro_dynogp.data.channels import Product, prepared
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.effects.base import Parameters
+from pyro_dynogp.effects.base import Parameters, centre_of
 from pyro_dynogp.models.product import factors
 from pyro_dynogp.models.system import DynamicSystem
+from pyro_dynogp.models.variants import Model, with_channels, with_products
 from pyro_dynogp.models.wiring import HIDDEN, Wire
 from pyro_dynogp.statistics.pictures import labelled
 from pyro_dynogp.statistics.responses import standardised
@@ -23,14 +25,42 @@ if TYPE_CHECKING:
 
 # Around a mode.
 DRAWS = 200
+# Of which products by twos are made: six of four.
+MOST_INPUTS = 4
 # Low and high values of an input, as quantiles of the record.
 ENDS = {"low": 0.02, "high": 0.98}
 
 
 def products(inputs: np.ndarray, signal: np.ndarray) -> list[np.ndarray]:
-    """Products (n, 1) of each input (n, n_u), standardised, with a signal (n,) less its mean."""
-    both = standardised(inputs) * (signal - signal.mean())[:, None]
-    return [column[:, None] for column in both.T]
+    """Products (n, c) of each input (n, n_u), standardised, with a signal (n,) less its mean.
+
+    Each by itself, and next to its products with the other inputs, where there are few.
+    """
+    given = standardised(inputs)
+    alone = [u[:, None] * (signal - signal.mean())[:, None] for u in given.T]
+    if not 2 <= given.shape[1] <= MOST_INPUTS:
+        return alone
+    others = [np.delete(given, place, axis=1) for place in range(given.shape[1])]
+    mixed = [u[:, None] * other for u, other in zip(given.T, others, strict=True)]
+    return [*alone, *(np.column_stack(pair) for pair in zip(alone, mixed, strict=True))]
+
+
+def with_products_of_inputs(model: Model, record: Record) -> Model | None:
+    """The model with products of inputs with the output that act back, and of inputs by twos.
+
+    What flows carries heat in as well as out: flow times the difference of two temperatures. None
+    where there are no two inputs, or too many, and where the model has no such products.
+    """
+    names = record.input_names
+    extended = with_products(model)
+    if extended is None or not 2 <= len(names) <= MOST_INPUTS:
+        return None
+    both = [
+        Product(one, other, centre_of(record, one), centre_of(record, other))
+        for one, other in itertools.combinations(names, 2)
+    ]
+    new = [channel for channel in both if channel not in model.channels]
+    return with_channels(extended, new) if new else None
 
 
 def dominant_rates(fit: Fit, fed: Wire, record: Record) -> Parameters:
@@ -61,14 +91,18 @@ def dominant_rates(fit: Fit, fed: Wire, record: Record) -> Parameters:
     F = F.reshape(*F.shape[:-1], inputs, -1)
     poles = dynamic.modes.poles
     given = prepared(record, fit.model.channels).inputs
+    products_of = (one for one in fit.model.channels if isinstance(one, Product))
+    made = {name for one in products_of for name in one.names}
     found: list[tuple[float, Parameters]] = []
-    for place in range(inputs):
+    for place, name in enumerate(scaling.input_names[:inputs]):
+        if name in made:  # of the inputs that it multiplies
+            continue
         at = np.quantile(given[:, place], list(ENDS.values()))
         low, high = (
             _dominant(poles, F[..., place, :], C, float(u))
             for u in (at - scaling.input_offset[place]) / scaling.input_scale[place]
         )
-        whose = "decay rate of the dominant mode at {} " + scaling.input_names[place]
+        whose = "decay rate of the dominant mode at {} " + name
         unit = f"1/{scaling.time_unit}"
         numbers = {
             labelled(whose.format(end), unit): (float(rate.mean()), float(rate.std()))

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import torch
 
+from pyro_dynogp.data.channels import Product
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.signals import hermite, hinges
 from pyro_dynogp.effects.base import Effect, Parameters
-from pyro_dynogp.effects.bilinear import dominant_rates, products
+from pyro_dynogp.effects.bilinear import dominant_rates, products, with_products_of_inputs
 from pyro_dynogp.lti.views import steady_state_gain
 from pyro_dynogp.models.compartments import in_place_of
 from pyro_dynogp.models.product import is_product
@@ -53,9 +54,11 @@ def nonlinear_feedback(residuals: Residuals, settings: LoopSettings, *, seed: in
     columns are h(mean) through each pole (`filtered`), with shapes h as in the test for a function
     of the output: Hermite polynomials of the second and third degree, apart and together, and
     piecewise linear functions with one knot; then the same of the mean's rate of change, which is
-    what friction acts on where a position is measured; and h = u y, products of each input with the
-    mean. What the mean itself does through the poles is nuisance. A sensor that is not linear sets
-    this test off as well: refits tell the two apart.
+    what friction acts on where a position is measured, and with several pairs of poles of that
+    one's, which is most of what a spring between two masses has beside the position of one; and
+    h = u y, products of each input with the mean, alone and beside those with other inputs. What
+    the mean itself does through the poles is nuisance. A sensor that is not linear sets this test
+    off as well: refits tell the two apart.
     `where`: ``output``, its name; ``products``, what the best product gains of what the best column
     does, zero to one.
 
@@ -71,8 +74,12 @@ def nonlinear_feedback(residuals: Residuals, settings: LoopSettings, *, seed: in
     31:350, 1969. Innovations against functions of past outputs: Tsay, Biometrika 73(2):461, 1986.
     """
     r = residuals
-    shapes = [*_shapes(r.mean), *_shapes(np.gradient(r.mean, r.time))]
-    shapes += products(r.inputs, r.mean)
+    signals = [r.mean, np.gradient(r.mean, r.time)]
+    if len(r.poles) > 1:
+        signals.append(np.gradient(signals[1], r.time))
+    shapes = [shape for signal in signals for shape in _shapes(signal)]
+    multiplied = products(r.inputs, r.mean)
+    shapes += multiplied
     variants = [_driven(r, shape) for shape in shapes]
     nuisance = _driven(r, r.mean[:, None])
     scan = lasting(r, variants, nuisance, settings, seed)
@@ -82,9 +89,9 @@ def nonlinear_feedback(residuals: Residuals, settings: LoopSettings, *, seed: in
         best = min(scan, ahead, key=lambda one: one.p_value)
         best = replace(best, p_value=min(1.0, 2.0 * best.p_value))
     share = 0.0
-    if r.inputs.shape[1]:
+    if multiplied:
         most = max(best.gain, np.finfo(float).tiny)
-        share = float(np.clip(best.gains[-r.inputs.shape[1] :].max() / most, 0.0, 1.0))
+        share = float(np.clip(best.gains[-len(multiplied) :].max() / most, 0.0, 1.0))
     label = labelled(f"simulated {r.output_name}", r.output_unit)
     return evidence(
         "nonlinear feedback",
@@ -169,7 +176,11 @@ class NonlinearFeedbackOfOutput(Effect):
         """
         share = float(evidence.where["products"])
         functions = [with_feedback(model), with_feedback(model, output=False, hidden=True)]
-        products = [with_products(model), with_products(model, hidden=True)]
+        products = [
+            with_products(model),
+            with_products_of_inputs(model, record),
+            with_products(model, hidden=True),
+        ]
         leading = [*functions, *products] if share >= ALIKE else functions
         if share == 1.0:
             leading = [*products, *functions]
@@ -202,6 +213,8 @@ class NonlinearFeedbackOfOutput(Effect):
         for factor in sorted(factors):
             other = unseen if factor.endswith(HIDDEN) else f"'{y}'"
             said.append(f"Inputs times {other} act back on its dynamics.")
+        if factors and any(isinstance(channel, Product) for channel in model.channels):
+            said.append("Products of inputs drive them as well.")
         return " ".join(said)
 
     def parameters(self, fit: Fit, evidence: Evidence, record: Record) -> Parameters:

@@ -45,6 +45,24 @@ def pushed(seed, n, size=5.0):
     return np.repeat(size * np.random.default_rng(seed).standard_normal(n // 4), 4)
 
 
+# A force pushes a mass, and a spring between this and another one that: positions and velocities.
+COUPLED = np.array([
+    [0.0, 1.0, 0.0, 0.0], [-7.5, -0.4, 6.0, 0.0], [0.0, 0.0, 0.0, 1.0], [7.5, 0.0, -10.0, -0.6],
+])  # fmt: skip
+
+
+def coupled(u, cubic):
+    """Position (n,) of the second mass, with cubic d^3 of the spring's length d, by small steps."""
+    x = np.zeros(4)
+    out = np.empty(len(u))
+    for k, force in enumerate(u):
+        out[k] = x[2]
+        for _ in range(20):
+            more = cubic * (x[0] - x[2]) ** 3
+            x = x + STEP / 20 * (COUPLED @ x + np.array([0.0, force - more, 0.0, more / 0.8]))
+    return out
+
+
 @pytest.fixture(scope="module")
 def spring():
     u = pushed(0, 600)
@@ -74,6 +92,19 @@ class TestDetection:
         # To first order the poles make the residual; a function at once explains less.
         assert found.gain > output_nonlinearity(r, SETTINGS).gain + 10.0
         assert found.gain > dead_time(r, SETTINGS).gain + 10.0
+
+    def test_a_spring_between_two_masses_is_found(self):
+        """Its length is neither the position that is measured nor how fast that changes."""
+        u = np.repeat(np.random.default_rng(1).uniform(-8.0, 8.0, 100), 6)
+        mean, y = coupled(u, 0.0), coupled(u, 0.5)
+        e = 0.02 * mean.std() * coloured(np.random.default_rng(2), len(u), 0.5)
+        poles = np.linalg.eigvals(COUPLED)
+        poles = poles[poles.imag > 0.0]
+        assert len(poles) == 2
+        r = residuals_of(y + e, mean, u[:, None], step=STEP, poles=poles)
+        assert nonlinear_feedback(r, SETTINGS).p_value < 1e-3
+        one = dataclasses.replace(r, poles=poles[:1])
+        assert nonlinear_feedback(one, SETTINGS).p_value > 0.05
 
     def test_the_poles_are_those_of_the_model(self):
         r = self.seen(0, 1.0)
