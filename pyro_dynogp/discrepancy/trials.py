@@ -198,9 +198,9 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
     Where they differ in how they extrapolate what is right in one stretch may be luck: of those
     that are rehearsed only those count whose forecasts are no worse than those of the base held at
     its last level, or else the last one, which leaves most open. Of others the first two are
-    fitted, and later ones while none leaves nothing but noise; those that join what earlier ones
-    have, which take most of the time, only where one of these forecasts best, and better than the
-    base.
+    fitted, and later ones while none leaves nothing but noise; those that join what two earlier
+    ones have, which take most of the time, only where one of these forecasts best, and better than
+    the base.
     """
     fold, settings = trial.folds[0], trial.settings
 
@@ -224,9 +224,10 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
             leading, most, errors = max(found, key=lambda one: float(one[1].sum()))
             if _are_noise(errors, leading):
                 break
-            if _joins(model, trial.models[:place]):
+            joined = [_back(one) for one in trial.models[:place] if _back(one) < _back(model)]
+            if len(joined) > 1:
                 least = held_out_density(trial.base, trial.record, fold, trial.score)
-                if most.sum() <= least.sum() or not _joins(model, [_unscaled(leading)]):
+                if most.sum() <= least.sum() or _back(leading.model) not in joined:
                     continue
             found += rated(refitted([model]))
     shape = trial.compared == "held out"
@@ -238,12 +239,9 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
     return best
 
 
-def _joins(model: Model, earlier: Sequence[Model]) -> bool:
-    """Whether a variant has what another one sends back, and more."""
-    own, *others = (
-        {name for _, layer in one.dynamic for name in layer.feedback} for one in (model, *earlier)
-    )
-    return any(other < own for other in others)
+def _back(model: Model) -> set[str]:
+    """Names of what acts back on the dynamics."""
+    return {name for _, layer in model.dynamic for name in layer.feedback}
 
 
 def _are_noise(errors: np.ndarray, fit: Fit) -> bool:

@@ -36,6 +36,7 @@ from pyro_dynogp.inference.starts.noise import louder, most_probable, with_likel
 from pyro_dynogp.inference.starts.plans import starting_points
 from pyro_dynogp.inference.starts.poles import grown
 from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
+from pyro_dynogp.models.forms import smooth_and_hidden
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.variants import have_same_parameters, without_noise_below_functions
 from pyro_dynogp.support.errors import invalid
@@ -136,8 +137,7 @@ def refits(
     fit: FittedKind, models: Sequence[Model], record: Record, run_of: Callable[[Model], Run]
 ) -> tuple[list[FittedKind], list[ValueError]]:
     """Refits of models that can be fitted, and why others cannot: a channel is constant there."""
-    found: list[FittedKind] = []
-    problems: list[ValueError] = []
+    found, problems = list[FittedKind](), list[ValueError]()
     for model in models:
         try:
             found.append(refit(fit, record, model=model, run=run_of(model)))
@@ -222,7 +222,7 @@ def _settled(
 def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     """Optima of a model that extends that of a fit, on long records with feedback from an excerpt.
 
-    What is new is found along the excerpt, and goes on along the whole.
+    What is new is found along the excerpt, and climbs on along the whole.
     """
     target = problem.target
     new = not have_same_parameters(target, fit.model)
@@ -243,14 +243,13 @@ def _extended(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
 def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     """Optima of a model that extends that of a fit.
 
-    With a layer more Adam climbs: better optimisers find functions that fit the noise (one that is
-    flat where outputs repeat, with next to no noise beyond it) and of which special cases have
-    none, so that gains would be those of climbs. With feedback Gauss-Newton climbs, and
-    kernels are then those of the highest evidence. Where the function is far from a line (a sensor
-    that reports a size) the linear fit is any of several poor optima: such a model starts from
-    linear fits of its own, too; a function in feedback from what is learnt, where nothing comes
-    back as yet.
-    Real poles in place of pairs are other dynamics: nothing that is learnt goes over to them.
+    With a layer more Adam climbs: better optimisers find functions that fit the noise and of which
+    special cases have none, so that gains would be those of climbs. With feedback Gauss-Newton
+    climbs, and kernels are then those of the highest evidence. Where the function is far from a
+    line (a sensor that reports a size) the linear fit is any of several poor optima: such a model
+    starts from linear fits of its own, too; a function in feedback from what is learnt, where
+    nothing comes back as yet, and a smooth one of a hidden signal from both. Real poles in place of
+    pairs are other dynamics: nothing that is learnt goes over to them.
 
     A linear model with more poles has the starts of a first fit, too: what is new may take the
     place of what is learnt.
@@ -276,7 +275,8 @@ def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
         )  # fmt: skip
 
     if len(target.layers) > len(fit.model.layers):
-        if not (run.steps or (target.has_feedback and fit.model.is_linear)):
+        line = target.has_feedback and fit.model.is_linear and not smooth_and_hidden(target.layers)
+        if not (run.steps or line):
             starts += starting_points(target, records, run, count=FRESH, steps=FRESH_STEPS)
         optimizer = _optimizer_of_layer(target)
         return climb(target, records, starts, [], run, optimizer=optimizer, effort=effort,

@@ -17,7 +17,7 @@ from torch.nn.functional import softplus
 
 from pyro_dynogp.data.channels import Channel
 from pyro_dynogp.models.arrival import free_delays
-from pyro_dynogp.models.layer import Known, Layer
+from pyro_dynogp.models.layer import Dynamic, Known, Layer
 from pyro_dynogp.models.wiring import HIDDEN
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
@@ -167,3 +167,9 @@ def form_of(layer: Layer) -> FormName | None:
     if not isinstance(layer, Known):
         return None
     return next((form for form, (f, _) in FORMS.items() if layer.function is f), None)
+
+
+def smooth_and_hidden(layers: Sequence[Layer]) -> bool:
+    """Whether all static layers are smooth, beside a signal of dynamics that nothing measures."""
+    hidden = any(isinstance(layer, Dynamic) and layer.hidden for layer in layers)
+    return hidden and not any(isinstance(layer, Known) for layer in layers)

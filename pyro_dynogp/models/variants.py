@@ -189,7 +189,9 @@ def with_input_function(model: Model) -> Model | None:
     return replace(model, layers=(first, *model.layers), scaling=None, output=None)
 
 
-def with_feedback(model: Model, *, output: bool = True, hidden: bool = False) -> Model | None:
+def with_feedback(
+    model: Model, *, output: bool = True, hidden: bool = False, step: bool = True
+) -> Model | None:
     """The model with static layers that see its last dynamic layer and act back on it.
 
     Static layers may follow that layer: they are what measures it. None where there is nothing to
@@ -197,8 +199,8 @@ def with_feedback(model: Model, *, output: bool = True, hidden: bool = False) ->
 
     Args:
         model: to extend. output: whether one function sees the output of the layer.
-        hidden: whether one sees a further signal of the same states, which nothing measures, and a
-            step of it comes back as well.
+        hidden: whether one sees a further signal of the same states, which nothing measures.
+        step: whether a step of that comes back as well.
     """
     if not model.dynamic:
         return None
@@ -208,8 +210,8 @@ def with_feedback(model: Model, *, output: bool = True, hidden: bool = False) ->
     if output:
         back.append(fed_back(layer.outputs, sees=own, name=FEEDBACK))
     if hidden:
-        function = fed_back(1, sees=unseen, name=HIDDEN_FEEDBACK)
-        back += [function, Form("step", sees=unseen, name=STEP)]
+        back.append(fed_back(1, sees=unseen, name=HIDDEN_FEEDBACK))
+        back += [Form("step", sees=unseen, name=STEP)] if step else []
     return _fed_back(model, back, hidden=hidden)
 
 

@@ -267,21 +267,24 @@ def test_both_functions_together_are_fitted_where_one_of_them_helps_and_leaves_s
 @pytest.mark.parametrize(
     ("levels", "noise", "fitted"),
     [
-        ((5.0, 9.0, 7.0, 8.0, 6.0, 6.0, 6.0, 9.0), (), 8),
-        # Products, forms and compartments are tried whatever functions do.
-        ((-3.0, 1.0, -2.0, -3.0, -3.0, -3.0, -3.0, 9.0), (), 8),
+        ((5.0, 9.0, 7.0, 8.0, 6.0, 6.0, 6.0, 6.0, 9.0), (), 9),
+        # Products, a step, forms and compartments are tried whatever functions do.
+        ((-3.0, 1.0, -2.0, -3.0, -3.0, -3.0, -3.0, -3.0, 9.0), (), 9),
         # Both functions are not where nothing helps,
-        ((-3.0, -1.0, -2.0, -3.0, -3.0, -3.0, -3.0, 9.0), (), 7),
-        ((-3.0, 1.0, -2.0, 3.0, -3.0, -3.0, -3.0, 9.0), (), 7),  # nor where products forecast best
-        ((-3.0, 1.0, -2.0, -3.0, 3.0, -3.0, -3.0, 9.0), (), 7),  # nor where forms do
-        ((-3.0, 1.0, -2.0, -3.0, -3.0, -3.0, 3.0, 9.0), (), 7),  # nor where compartments do
-        # The rest is not beside noise alone, nor forms of a hidden signal, nor compartments,
-        ((5.0, 9.0, 20.0, 8.0, 6.0, 6.0, 6.0, 9.0), (20.0,), 3),
-        ((5.0, 9.0, 7.0, 8.0, 20.0, 6.0, 6.0, 9.0), (20.0,), 5),
-        ((5.0, 9.0, 7.0, 8.0, 6.0, 20.0, 6.0, 9.0), (20.0,), 6),
+        ((-3.0, -1.0, -2.0, -3.0, -3.0, -3.0, -3.0, -3.0, 9.0), (), 8),
+        ((-3.0, 1.0, -2.0, 3.0, -3.0, -3.0, -3.0, -3.0, 9.0), (), 8),  # nor where products lead
+        ((-3.0, 1.0, -2.0, -3.0, -3.0, 3.0, -3.0, -3.0, 9.0), (), 8),  # nor where forms do
+        ((-3.0, 1.0, -2.0, -3.0, -3.0, -3.0, -3.0, 3.0, 9.0), (), 8),  # nor where compartments do
+        # but where a step does.
+        ((-3.0, 1.0, -2.0, -3.0, 3.0, -3.0, -3.0, -3.0, 9.0), (), 9),
+        # The rest is not beside noise alone, nor a step, nor forms, nor compartments,
+        ((5.0, 9.0, 20.0, 8.0, 6.0, 6.0, 6.0, 6.0, 9.0), (20.0,), 3),
+        ((5.0, 9.0, 7.0, 8.0, 20.0, 6.0, 6.0, 6.0, 9.0), (20.0,), 5),
+        ((5.0, 9.0, 7.0, 8.0, 6.0, 20.0, 6.0, 6.0, 9.0), (20.0,), 6),
+        ((5.0, 9.0, 7.0, 8.0, 6.0, 6.0, 20.0, 6.0, 9.0), (20.0,), 7),
         # unless another one forecasts better.
-        ((5.0, 9.0, 7.0, 8.0, 6.0, 6.0, 6.0, 9.0), (7.0,), 8),
-        ((5.0, 9.0, 7.0, 8.0, 6.0, 6.0, 6.0, 9.0), (9.0,), 2),
+        ((5.0, 9.0, 7.0, 8.0, 6.0, 6.0, 6.0, 6.0, 9.0), (7.0,), 9),
+        ((5.0, 9.0, 7.0, 8.0, 6.0, 6.0, 6.0, 6.0, 9.0), (9.0,), 2),
     ],
 )
 def test_later_variants_are_fitted_one_by_one_while_something_is_left(
@@ -290,7 +293,7 @@ def test_later_variants_are_fitted_one_by_one_while_something_is_left(
     plain = dgp.LinearDynamicGP(1, pairs=1)
     said = SimpleNamespace(where={"output": "y", "products": 0.9})
     models = tuple(NonlinearFeedbackOfOutput().extend(plain, said, record))
-    assert len(models) == 8
+    assert len(models) == 9
     made = []
 
     def again(fit, training, *, model, run):

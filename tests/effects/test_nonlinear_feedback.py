@@ -181,11 +181,12 @@ class TestBlock:
         more = (*forms[:2], "hidden_root", "hidden_edge", "hidden_step")
         assert wired == [
             {"g": (("inputs",), ("feedback",)), "feedback": output},
-            {"g": (("inputs",), unseen), **dict.fromkeys(unseen, hidden)},
+            {"g": (("inputs",), unseen[:1]), unseen[0]: hidden},
             {"g": (("inputs",), ("feedback_product",)),
              "feedback_product": (("inputs", "g"), ())},
             {"g": (("inputs",), ("hidden_product",)),
              "hidden_product": (("inputs", "g_hidden"), ())},
+            {"g": (("inputs",), unseen), **dict.fromkeys(unseen, hidden)},
             {"g": (("inputs",), forms), **dict.fromkeys(forms, output)},
             {"g": (("inputs",), more), **dict.fromkeys(more[:2], output),
              **dict.fromkeys(more[2:], hidden)},
@@ -193,17 +194,18 @@ class TestBlock:
             {"g": (("inputs",), ("feedback", *unseen)), "feedback": output,
              **dict.fromkeys(unseen, hidden)},
         ]  # fmt: skip
-        for model in (*variants[:6], variants[7]):
+        for model in (*variants[:7], variants[8]):
             assert model.output_wire.name == "g"
             assert model.dynamic[0][1].pairs == 2
         said = [EFFECT.sentence(SAID, model) for model in variants]
         assert said == [
             "What the test said.",
-            "A nonlinear function of a signal of the dynamics of 'x' that is not measured acts "
-            "back on them.",
+            unseen := "A nonlinear function of a signal of the dynamics of 'x' that is not "
+            "measured acts back on them.",
             "Inputs times 'x' act back on its dynamics.",
             "Inputs times a signal of the dynamics of 'x' that is not measured act back on its "
             "dynamics.",
+            unseen,
             "What the test said.",
             both := "Nonlinear functions of 'x', and of a signal of the dynamics of 'x' that is "
             "not measured, act back on them.",
@@ -225,7 +227,7 @@ class TestBlock:
         said = SimpleNamespace(where={"output": "x", "products": share})
         made = EFFECT.extend(dgp.LinearDynamicGP(1), said, spring)
         assert [one.dynamic[0][0].feedback[0] for one in made] == [
-            *leading, "output_root", "output_root", "root1", "feedback"
+            *leading, "hidden_feedback", "output_root", "output_root", "root1", "feedback"
         ]  # fmt: skip
         assert made[-1].dynamic[0][0].feedback == (
             "feedback", "hidden_feedback", "feedback_step"
@@ -240,7 +242,7 @@ class TestBlock:
     def test_what_is_there_is_not_added_again(self, spring):
         """To a function of the output one of a hidden signal, and the other way round."""
         made = EFFECT.extend(dgp.LinearDynamicGP(1), SAID, spring)
-        first, second, product, hidden, forms, more, chain, both = made
+        first, second, product, hidden, _, forms, more, chain, both = made
         back = {"feedback", "hidden_feedback", "feedback_step"}
         products = [{"feedback_product"}, {"hidden_product"}]
         of_output = {"output_root", "output_edge", "output_step"}
@@ -249,14 +251,15 @@ class TestBlock:
             own = set(model.dynamic[0][0].feedback)
             extended = EFFECT.extend(model, SAID, spring)
             made = [set(one.dynamic[0][0].feedback) for one in extended]
-            assert made[:3] == [back, own | products[0], own | products[1]]
+            assert made[:3] == [back - {"feedback_step"}, own | products[0], own | products[1]]
+            assert (back in made) == (model is first)
             assert own | others in made
             assert extended[0].dynamic[0][1].hidden == 1
         made = [set(one.dynamic[0][0].feedback) for one in EFFECT.extend(forms, SAID, spring)]
         assert of_output | of_hidden in made
         for model in (more, both):
             assert len(EFFECT.extend(model, SAID, spring)) == 2  # products
-        assert len(EFFECT.extend(product, SAID, spring)) == 6
+        assert len(EFFECT.extend(product, SAID, spring)) == 7
         for model in EFFECT.extend(chain, SAID, spring):  # of inputs and the level
             assert model.dynamic[-1][0].feedback[-1] == "feedback_product"
             assert EFFECT.sentence(SAID, model).endswith(
@@ -265,7 +268,7 @@ class TestBlock:
         for model in (product, hidden):
             assert model not in EFFECT.extend(model, SAID, spring)
         own, *_ = EFFECT.extend(dgp.NonlinearFeedback(1), SAID, spring)
-        assert own.dynamic[0][0].feedback == ("f", "hidden_feedback", "feedback_step")
+        assert own.dynamic[0][0].feedback == ("f", "hidden_feedback")
         more = EFFECT.extend(dgp.NonlinearFeedback(1, hidden=2), SAID, spring)
         assert [set(one.dynamic[0][0].feedback[2:]) for one in more] == products
 

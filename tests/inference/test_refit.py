@@ -158,6 +158,34 @@ def test_what_is_new_in_feedback_is_looked_for_along_an_excerpt_of_long_records(
     assert climbs == [(80, 1)]
 
 
+@pytest.mark.parametrize(
+    ("options", "fresh"),
+    [
+        ({"output": False, "hidden": True, "step": False}, [refits.FRESH]),
+        ({"output": False, "hidden": True}, []),
+        ({}, []),
+    ],
+)
+def test_a_smooth_function_of_a_hidden_signal_starts_afresh_as_well(monkeypatch, options, fresh):
+    """A spring between two masses was 70 nats lower where only what the line knew was a start."""
+    record, model = make_record(n=60, missing=False), dgp.LinearDynamicGP(1, pairs=1)
+    fit = dgp.fit(model, record, method="map", restarts=1, workers=1, progress=False)
+    asked, climb = [], refits.climb
+
+    def starts(model, records, run, *, count, steps):
+        asked.append(count)
+        return []
+
+    def shortly(*given, **named):
+        return climb(*given, **named | {"steps": 2})
+
+    monkeypatch.setattr(refits, "starting_points", starts)
+    monkeypatch.setattr(refits, "climb", shortly)
+    monkeypatch.setattr(refits, "kernels_by_evidence", lambda model, records, optima, run: optima)
+    refit(fit, record, model=with_feedback(model, **options))
+    assert asked == fresh
+
+
 def late_and_bent(seed: int) -> dgp.Record:
     """A bent input, seven samples late, through a well damped second order."""
     rng = np.random.default_rng(seed)
