@@ -253,15 +253,15 @@ def _are_noise(errors: np.ndarray, fit: Fit) -> bool:
 
 
 def _is_more_probable(one: Fit, best: Fit, gain: np.ndarray, settings: LoopSettings) -> bool:
-    """Whether there is very strong evidence for a variant in the data that both are fitted to.
+    """Whether there is very strong evidence for a variant in the data of both, learnt and held out.
 
-    Held-out data may not speak against it: neither with certainty, nor so much that little is left
-    of the evidence of both. By how little held-out data differ is a matter of rounding.
+    The density of the data held out adds to that of the data learnt from. They may not speak
+    against it with certainty.
 
     Args:
         gain: of its log-density on held-out data [nats].
     """
-    together = log_bayes_factor(one, best) + min(float(gain.sum()), 0.0)
+    together = log_bayes_factor(one, best) + float(gain.sum())
     return together > VERY_STRONG and not certain(-gain, settings)
 
 
