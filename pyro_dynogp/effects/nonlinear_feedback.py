@@ -151,8 +151,8 @@ class NonlinearFeedbackOfOutput(Effect):
 
     A function of the output, of a signal of the same states that nothing measures (a velocity, the
     level of another tank), or one of each; roots, edges and a step of both; products of the inputs
-    with the output, or with such a signal; two compartments in place of linear dynamics. A later
-    one of them only where it is certainly better.
+    with the output, and with each other, or with such a signal; two compartments in place of linear
+    dynamics. A later one of them only where it is certainly better.
     """
 
     name = "nonlinear feedback"

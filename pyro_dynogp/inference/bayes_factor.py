@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
+
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.laplace import log_evidence
@@ -25,12 +29,21 @@ def log_evidence_of(fit: Fitted) -> float:
     """Log p(y) of the data that a mode is fitted to, as far as its neighbourhood goes [nats].
 
     Schwarz's criterion would pay for every inducing value of a function as for a parameter of its
-    own, which most of them are not.
+    own, which most of them are not. Minus infinity where predictions next to the mode are not
+    finite.
     """
     model = fit.model.collapsed
-    return log_evidence(Potential(model, (model.prepare(fit.records),), fit.mode), fit.mode)
+    potential = Potential(model, (model.prepare(fit.records),), fit.mode)
+    try:
+        found = log_evidence(potential, fit.mode)
+    except np.linalg.LinAlgError:  # of a curvature that is not finite
+        return -math.inf
+    return found if math.isfinite(found) else -math.inf
 
 
 def log_bayes_factor(one: Fitted, other: Fitted) -> float:
-    """Of one fit against another of the same data [nats]: how far these speak for it."""
+    """Of one fit against another of the same data [nats]: how far these speak for it.
+
+    Not a number where neither has finite predictions next to it.
+    """
     return log_evidence_of(one) - log_evidence_of(other)

@@ -54,7 +54,8 @@ def innovate_together(problem: FilterProblem) -> tuple[np.ndarray, np.ndarray, n
 
     found = np.concatenate(each(group, -(-count // WIDTH)))
     error, variance = found[:, 0], found[:, 1]
-    with np.errstate(divide="ignore", invalid="ignore"):  # where there is no density
+    # Where there is no density, or runs have grown without bound.
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         if gaussian:
             density = -0.5 * (error**2 / variance + np.log(2.0 * np.pi * variance))
         else:

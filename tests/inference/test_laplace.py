@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import pyro_dynogp as dgp
-from pyro_dynogp.inference.bayes_factor import counted, log_bayes_factor
+from pyro_dynogp.inference.bayes_factor import counted, log_bayes_factor, log_evidence_of
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.laplace import fisher_normal, laplace, log_evidence
 from pyro_dynogp.inference.methods.base import Problem
@@ -109,6 +109,18 @@ def test_inducing_values_that_tell_nothing_are_no_parameters():
     assert counted(many)[0] - counted(few)[0] == 20
     assert abs(log_bayes_factor(many, few)) < 3.0
     assert log_bayes_factor(few, many) == pytest.approx(-log_bayes_factor(many, few))
+
+
+def test_no_evidence_next_to_runs_that_grow_without_bound(monkeypatch):
+    fit = dgp.fit(
+        dgp.LinearDynamicGP(1), GAPS, method="map", restarts=1, steps=1, workers=1, progress=False
+    )
+    assert np.isfinite(log_evidence_of(fit))
+    for value in (np.nan, np.inf):
+        matrix = np.full((9, 9), value)
+        monkeypatch.setattr(Potential, "hessian", lambda *a, matrix=matrix, **k: matrix)
+        assert log_evidence_of(fit) == -math.inf
+        assert not log_bayes_factor(fit, fit) > 0.0
 
 
 def test_energies_without_gradients():

@@ -65,6 +65,17 @@ def one_by_one(problems):
     return [np.stack(part) for part in zip(*found, strict=True)]
 
 
+def test_errors_without_bound_have_no_density_and_no_warning():
+    problems = [
+        replace(one, y=torch.full_like(one.y, 1e200)) for one in points("one table", FEWEST)
+    ]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        _, variance, density = innovate_together(together(problems))
+    assert np.isfinite(variance).any()
+    assert (density[np.isfinite(variance)] == -np.inf).all()
+
+
 @pytest.mark.parametrize("count", [FEWEST, WIDTH, WIDTH + 3])
 @pytest.mark.parametrize("case", TABLES)
 def test_tables_have_the_same_bits(case, count):
