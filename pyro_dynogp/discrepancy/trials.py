@@ -255,14 +255,15 @@ def _are_noise(errors: np.ndarray, fit: Fit) -> bool:
 def _is_more_probable(one: Fit, best: Fit, gain: np.ndarray, settings: LoopSettings) -> bool:
     """Whether there is very strong evidence for a variant in the data of both, learnt and held out.
 
-    The density of the data held out adds to that of the data learnt from. They may not speak
-    against it with certainty.
+    The density of the data held out adds to the evidence of those learnt from. Neither may speak
+    against it: these with very strong evidence, those with certainty. A block is short.
 
     Args:
         gain: of its log-density on held-out data [nats].
     """
-    together = log_bayes_factor(one, best) + float(gain.sum())
-    return together > VERY_STRONG and not certain(-gain, settings)
+    factor = log_bayes_factor(one, best)
+    against = factor < -VERY_STRONG or certain(-gain, settings)
+    return factor + float(gain.sum()) > VERY_STRONG and not against
 
 
 def with_substeps(trial: Trial, tried: Tried) -> Tried:

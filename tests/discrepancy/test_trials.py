@@ -352,6 +352,16 @@ def test_of_functions_that_forecast_alike_the_more_probable_one_is_kept(
     assert trials.run(trial).model == models[kept]
 
 
+@pytest.mark.parametrize(
+    ("factor", "gain", "more"),
+    [(-4.9, 10.0, True), (-4.9, 9.8, False), (-5.1, 90.0, False), (np.nan, 90.0, False)],
+)
+def test_held_out_data_do_not_outweigh_very_strong_evidence(monkeypatch, factor, gain, more):
+    monkeypatch.setattr(trials, "log_bayes_factor", lambda one, best: factor)
+    monkeypatch.setattr(trials, "certain", lambda gain, settings: False)
+    assert trials._is_more_probable(None, None, np.array([gain]), SETTINGS) is more
+
+
 def test_substeps_that_cannot_be_fitted_are_left(record, monkeypatch):
     model = with_feedback(dgp.LinearDynamicGP(1, pairs=1), output=False, hidden=True)
     fold = np.arange(N) >= TRAINING
