@@ -10,17 +10,17 @@ is linear in what the filter has at the beginning of the step: x(0) and what com
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from pyro_dynogp.lti.fused import propagators
 from pyro_dynogp.lti.grid import TimeGrid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.models.wiring import Dynamic, Wire
 
-# Where the formulas lose digits, and how many terms their series has there.
+# Where the formula of p_2 loses digits, and how many terms its series has there.
 _SMALL, _TERMS = 0.1, 12
 
 
@@ -58,35 +58,23 @@ def mean_of_lag(modes: Modes, grid: TimeGrid, known: Tensor, held: Tensor) -> La
         modes: of the lag. known: (*b, n) its output, as far as known inputs cause it.
         held: (*b, m, n_u, E) share of each static output in each of its inputs.
     """
-    rate = modes.poles.real  # (*b, 1)
-    z = rate * grid.steps
-    first, second = _first(z), _second(z)
+    decay, held_gain = (x[..., 0].real for x in propagators(modes, grid.steps))  # (*b, m)
+    first, second = held_gain / grid.steps, _second(modes.poles.real * grid.steps)
     gain = 2.0 * (modes.C.real[..., 0, :, None] * modes.B.real)[..., 0, :]  # (*b, n_u)
     gains = (grid.steps * second)[..., None] * (gain[..., None, None, :] @ held)[..., 0, :]
     step = torch.from_numpy(grid.step_index[1:].clip(0))
     # What drives the known part follows from its two ends; a step of no length adds nothing.
-    grown = known[..., 1:] - torch.exp(z)[..., step] * known[..., :-1]
+    grown = known[..., 1:] - decay[..., step] * known[..., :-1]
     added = (second / first)[..., step] * grown
     added = torch.where(torch.from_numpy(grid.step_index[1:] >= 0), added, 0.0)
     nothing = added.new_zeros((*added.shape[:-1], 1))
     return LagMean(first, gains, torch.cat([added, nothing], -1))
 
 
-def _first(z: Tensor) -> Tensor:
-    """(exp(z) - 1)/z for z <= 0."""
-    away = torch.where(z.abs() < _SMALL, -1.0, z)
-    return torch.where(z.abs() < _SMALL, _series(z, 1), torch.expm1(away) / away)
-
-
 def _second(z: Tensor) -> Tensor:
     """(exp(z) - 1 - z)/z^2 for z <= 0."""
     away = torch.where(z.abs() < _SMALL, -1.0, z)
-    return torch.where(z.abs() < _SMALL, _series(z, 2), (torch.expm1(away) - away) / away.square())
-
-
-def _series(z: Tensor, first: int) -> Tensor:
-    """Sum over k >= 0 of z^k / (k + first)!."""
-    total = torch.ones_like(z)
+    series = torch.ones_like(z)
     for k in range(_TERMS, 0, -1):
-        total = 1.0 + total * z / (first + k)
-    return total / math.factorial(first)
+        series = 1.0 + series * z / (k + 2)
+    return torch.where(z.abs() < _SMALL, 0.5 * series, (torch.expm1(away) - away) / away.square())

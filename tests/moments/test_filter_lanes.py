@@ -70,7 +70,7 @@ def test_errors_without_bound_have_no_density_and_no_warning():
         replace(one, y=torch.full_like(one.y, 1e200)) for one in points("one table", FEWEST)
     ]
     with warnings.catch_warnings():
-        warnings.simplefilter("error")
+        warnings.simplefilter("error")  # that none is seen is what is tested
         _, variance, density = innovate_together(together(problems))
     assert np.isfinite(variance).any()
     assert (density[np.isfinite(variance)] == -np.inf).all()
