@@ -19,7 +19,8 @@ from pyro_dynogp.inference.bayes_factor import VERY_STRONG, energy, log_bayes_fa
 from pyro_dynogp.inference.refit import race, refit, refits
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.models.delays import comparable, longest_delay
-from pyro_dynogp.models.variants import Model, with_usual_substeps
+from pyro_dynogp.models.feedback_variants import with_usual_substeps
+from pyro_dynogp.models.variants import Model
 from pyro_dynogp.statistics.settings import LoopSettings
 
 # Most steps of one size that a number of a variant takes.
@@ -200,36 +201,40 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
     its last level, or else the last one, which leaves most open. Of others the first two are
     fitted, and later ones while none leaves nothing but noise; those that join what two earlier
     ones have, which take most of the time, only where one of these forecasts best, and better than
-    the base.
+    the base. Variants that cannot be fitted are left out.
     """
     fold, settings = trial.folds[0], trial.settings
+    problems: list[ValueError] = []
 
     def refitted(models: Sequence[Model]) -> list[Fit]:
-        return [refit(trial.base, training, model=model, run=trial.run) for model in models]
+        fits, why = refits(trial.base, models, training, lambda _: trial.run)
+        problems.extend(why)
+        return fits
 
     def rated(fits: Sequence[Fit]) -> list[tuple[Fit, np.ndarray, np.ndarray]]:
         return [(fit, *scored(fit, trial.record, fold, trial.score)) for fit in fits]
 
     if trial.compared == "rehearsed":
         # But those that the training data say nothing of, as a later ramp.
-        fits, problems = refits(trial.base, trial.models, training, lambda _: trial.run)
-        if not fits:
-            raise problems[0]
-        found = rated(
-            lasting(fits, trial.base, trial.record, fold, trial.run, settings) or fits[-1:]
-        )
+        fits = refitted(trial.models)
+        if fits:
+            fits = lasting(fits, trial.base, trial.record, fold, trial.run, settings) or fits[-1:]
+        found = rated(fits)
     else:
         found = rated(refitted(trial.models[:2]))
         for place, model in enumerate(trial.models[2:], 2):
-            leading, most, errors = max(found, key=lambda one: float(one[1].sum()))
-            if _are_noise(errors, leading):
-                break
-            joined = [_back(one) for one in trial.models[:place] if _back(one) < _back(model)]
-            if len(joined) > 1:
-                least = held_out_density(trial.base, trial.record, fold, trial.score)
-                if most.sum() <= least.sum() or _back(leading.model) not in joined:
-                    continue
+            if found:
+                leading, most, errors = max(found, key=lambda one: float(one[1].sum()))
+                if _are_noise(errors, leading):
+                    break
+                joined = [_back(one) for one in trial.models[:place] if _back(one) < _back(model)]
+                if len(joined) > 1:
+                    least = held_out_density(trial.base, trial.record, fold, trial.score)
+                    if most.sum() <= least.sum() or _back(leading.model) not in joined:
+                        continue
             found += rated(refitted([model]))
+    if not found:
+        raise problems[0]
     shape = trial.compared == "held out"
     best, highest, _ = found[0]
     for one, own, _ in found[1:]:

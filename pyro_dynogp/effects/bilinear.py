@@ -13,9 +13,10 @@ from pyro_dynogp.criticism.posterior_draws import draws_of
 from pyro_dynogp.data.channels import Product, prepared
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.effects.base import Parameters, centre_of
+from pyro_dynogp.models.feedback_variants import with_products
 from pyro_dynogp.models.product import factors
 from pyro_dynogp.models.system import DynamicSystem
-from pyro_dynogp.models.variants import Model, with_channels, with_products
+from pyro_dynogp.models.variants import Model, with_channels
 from pyro_dynogp.models.wiring import HIDDEN, Wire
 from pyro_dynogp.statistics.pictures import labelled
 from pyro_dynogp.statistics.responses import standardised

@@ -16,9 +16,16 @@ from pyro_dynogp.effects.base import Effect, Parameters
 from pyro_dynogp.effects.bilinear import dominant_rates, products, with_products_of_inputs
 from pyro_dynogp.lti.views import steady_state_gain
 from pyro_dynogp.models.compartments import in_place_of
+from pyro_dynogp.models.feedback_variants import (
+    with_feedback,
+    with_forms,
+    with_hysteresis,
+    with_products,
+)
+from pyro_dynogp.models.forms import form_of, hysteresis
 from pyro_dynogp.models.product import is_product
 from pyro_dynogp.models.system import DynamicSystem
-from pyro_dynogp.models.variants import Model, with_feedback, with_forms, with_products
+from pyro_dynogp.models.variants import Model
 from pyro_dynogp.models.wiring import HIDDEN
 from pyro_dynogp.statistics.bootstrap import Scan
 from pyro_dynogp.statistics.detecting import lasting
@@ -55,7 +62,8 @@ def nonlinear_feedback(residuals: Residuals, settings: LoopSettings, *, seed: in
     of the output: Hermite polynomials of the second and third degree, apart and together, and
     piecewise linear functions with one knot; then the same of the mean's rate of change, which is
     what friction acts on where a position is measured, and with several pairs of poles of that
-    one's, which is most of what a spring between two masses has beside the position of one; and
+    one's, which is most of what a spring between two masses has beside the position of one, and the
+    two products that a hysteresis is made of (see `Form`) of the mean and its rate of change; and
     h = u y, products of each input with the mean, alone and beside those with other inputs. What
     the mean itself does through the poles is nuisance. A sensor that is not linear sets this test
     off as well: refits tell the two apart.
@@ -78,6 +86,8 @@ def nonlinear_feedback(residuals: Residuals, settings: LoopSettings, *, seed: in
     if len(r.poles) > 1:
         signals.append(np.gradient(signals[1], r.time))
     shapes = [shape for signal in signals for shape in _shapes(signal)]
+    if len(r.poles) > 1:
+        shapes.append(_hysteretic(signals[1], r.mean))
     multiplied = products(r.inputs, r.mean)
     shapes += multiplied
     variants = [_driven(r, shape) for shape in shapes]
@@ -118,7 +128,9 @@ def _one_step_ahead(r: Residuals, settings: LoopSettings, seed: int) -> Scan:
         deviations=r.deviations / one_step_sd(r, settings),
     )
     last = _earlier(y, 1)
-    shapes = [*_shapes(last), *_shapes(last - _earlier(y, 2))]
+    change = last - _earlier(y, 2)
+    shapes = [*_shapes(last), *_shapes(change)]
+    shapes += [_hysteretic(change, last)] if len(r.poles) > 1 else []
     shapes += products(_earlier(r.inputs, 1), last)
     variants = [with_past(shape) for shape in shapes]
     lags = [_earlier(y, k + 1) for k in range(LAGS)]
@@ -138,6 +150,14 @@ def _shapes(signal: np.ndarray) -> list[np.ndarray]:
     return [powers[:, :1], powers[:, 1:], powers, *bends.T[:, :, None]]
 
 
+def _hysteretic(rate: np.ndarray, signal: np.ndarray) -> np.ndarray:
+    """The parts (n, 2) of a hysteresis of a signal (n,) that changes at a rate, standardised."""
+    both = [torch.as_tensor(x) for x in standardised(np.column_stack([rate, signal])).T]
+    none = torch.zeros((), dtype=torch.float64)
+    parts = [hysteresis(v, w, none).numpy() for v, w in (both, both[::-1])]
+    return standardised(np.column_stack(parts))
+
+
 def _driven(r: Residuals, signals: np.ndarray) -> np.ndarray:
     """Signals (n, c) through each pole of the model, themselves and one step later, (n, c K)."""
     # One that does not decay within the record is as good as one that does so over its length.
@@ -152,7 +172,7 @@ class NonlinearFeedbackOfOutput(Effect):
     A function of the output, of a signal of the same states that nothing measures (a velocity, the
     level of another tank), or one of each; roots, edges and a step of both; products of the inputs
     with the output, and with each other, or with such a signal; two compartments in place of linear
-    dynamics. A later one of them only where it is certainly better.
+    dynamics; a hysteresis of two such signals. A later one only where it is certainly better.
     """
 
     name = "nonlinear feedback"
@@ -190,14 +210,17 @@ class NonlinearFeedbackOfOutput(Effect):
             leading = [*products, *functions]
         forms = [with_forms(model), with_forms(model, hidden=True)]
         chain = in_place_of(model, CHAIN)
-        extended = [*leading, stepped, *forms, chain, with_feedback(model, hidden=True)]
+        past, both = with_hysteresis(model), with_feedback(model, hidden=True)
+        extended = [*leading, stepped, *forms, chain, past, both]
         return list({repr(variant): variant for variant in extended if variant}.values())
 
     def sentence(self, evidence: Evidence, model: Model) -> str:
         """Of which signals it is a function."""
         wires = {wire.name: wire for wire in model.wires}
         back = [wires[name] for wire in model.wires for name in wire.feedback]
-        functions = {s for one in back if not is_product(one.layer) for s in one.sources}
+        past = [one for one in back if form_of(one.layer) == "hysteresis"]
+        smooth = [one for one in back if not is_product(one.layer) and one not in past]
+        functions = {s for one in smooth for s in one.sources}
         factors = {one.sources[-1] for one in back if is_product(one.layer)}
         y = evidence.where["output"]
         if model.has_real_poles and not factors:
@@ -212,8 +235,13 @@ class NonlinearFeedbackOfOutput(Effect):
             said.append(f"A nonlinear function of {unseen} acts back on them.")
         elif hidden:
             said.append(f"Nonlinear functions of '{y}', and of {unseen}, act back on them.")
-        elif functions or not factors:
+        elif functions or not (factors or past):
             said.append(evidence.sentence)
+        if past:
+            said.append(
+                "It depends on the past: a hysteresis of two signals of the dynamics of "
+                f"'{y}' that are not measured acts back on them."
+            )
         for factor in sorted(factors):
             other = unseen if factor.endswith(HIDDEN) else f"'{y}'"
             said.append(f"Inputs times {other} act back on its dynamics.")

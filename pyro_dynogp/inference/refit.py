@@ -36,7 +36,7 @@ from pyro_dynogp.inference.starts.noise import louder, most_probable, with_likel
 from pyro_dynogp.inference.starts.plans import starting_points
 from pyro_dynogp.inference.starts.poles import grown
 from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
-from pyro_dynogp.models.forms import smooth_and_hidden
+from pyro_dynogp.models.forms import have_no_place
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.variants import have_same_parameters, without_noise_below_functions
 from pyro_dynogp.support.errors import invalid
@@ -49,7 +49,7 @@ SAME_STEPS, ADAM_STEPS, SVI_STEPS = 300, 200, 400
 LINEAR_STEPS, LAYERED_STEPS = 100, 100
 ADDED_STEPS: Mapping[str, int] = MappingProxyType({"gauss-newton": 60, "lbfgs": 300, "adam": 300})
 # Starts from linear fits of its own that a model with a layer more has beside what is learnt, those
-# of one whose dynamics take the place of what is learnt, and iterations of those fits.
+# of one with several hidden signals or other dynamics than the learnt, and those fits' iterations.
 FRESH, REPLACED, FRESH_STEPS = 4, 12, 40
 # Of the same model every start goes on, near its optimum; of a linear one that is extended half of
 # them do, side by side, as processors are kept busy by other trials. With feedback all go on: after
@@ -248,15 +248,13 @@ def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     climbs, and kernels are then those of the highest evidence. Where the function is far from a
     line (a sensor that reports a size) the linear fit is any of several poor optima: such a model
     starts from linear fits of its own, too; a function in feedback from what is learnt, where
-    nothing comes back as yet, and a smooth one of a hidden signal from both. Real poles in place of
-    pairs are other dynamics: nothing that is learnt goes over to them.
+    nothing comes back as yet, and one of hidden signals that has no place from both. Real poles
+    take over nothing from pairs. A linear model with more poles has the starts of a first fit, too:
+    what is new may take the place of what is learnt.
 
-    A linear model with more poles has the starts of a first fit, too: what is new may take the
-    place of what is learnt.
-
-    Process noise that has explained what the smaller model lacks keeps the larger one from
-    explaining it: one climb goes without any first, and takes that of a fresh start then. Not where
-    variants are compared: their order is the same without.
+    Process noise that has explained what the smaller model lacks keeps the larger one from it: one
+    climb goes without any first, and takes that of a fresh start then. Not where variants are
+    compared: their order is the same without.
     """
     target, records = problem.target, problem.records
     if target.has_real_poles and not fit.model.has_real_poles:
@@ -275,9 +273,10 @@ def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
         )  # fmt: skip
 
     if len(target.layers) > len(fit.model.layers):
-        line = target.has_feedback and fit.model.is_linear and not smooth_and_hidden(target.layers)
-        if not (run.steps or line):
-            starts += starting_points(target, records, run, count=FRESH, steps=FRESH_STEPS)
+        line = target.has_feedback and fit.model.is_linear
+        if not run.steps and (not line or have_no_place(target.layers)):
+            count = REPLACED if any(layer.hidden > 1 for _, layer in target.dynamic) else FRESH
+            starts += starting_points(target, records, run, count=count, steps=FRESH_STEPS)
         optimizer = _optimizer_of_layer(target)
         return climb(target, records, starts, [], run, optimizer=optimizer, effort=effort,
                      steps=run.steps or ADDED_STEPS[optimizer])  # fmt: skip

@@ -6,10 +6,10 @@ from dataclasses import replace
 from typing import Unpack
 
 from pyro_dynogp.layers.noise import Gaussian, Likelihood
+from pyro_dynogp.models.feedback_variants import noise_allows_feedback
 from pyro_dynogp.models.forms import Form, usual_substeps
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.structure import ModelOptions
-from pyro_dynogp.models.variants import noise_allows_feedback
 from pyro_dynogp.models.wiring import Dynamic, Layer
 from pyro_dynogp.support.errors import verify
 

@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from pyro_dynogp.layers.functions import StaticFunction, even_grid
+from pyro_dynogp.models.forms import MEAN_SIZE, hysteresis
 from pyro_dynogp.models.known import KnownFunction
 from pyro_dynogp.models.product import Products
-from pyro_dynogp.moments.functions import KERNELS, PRODUCT, TABLE
+from pyro_dynogp.moments.functions import HYSTERESIS, KERNELS, PRODUCT, TABLE
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.tensors import broadcast
 
@@ -117,6 +118,16 @@ def _function(block: Block, M: int, widest: int) -> tuple[int, dict[str, Tensor]
     if isinstance(function, KnownFunction) and isinstance(function.function, Products):
         _check_known_first(block, function.name, function.function.first)
         return PRODUCT + function.function.first, values | _shifted(function, widest)
+    if isinstance(function, KnownFunction) and function.function is hysteresis:
+        Z = torch.nn.functional.pad(-function.shift, (0, widest - d)).unsqueeze(-2)
+        values["Z"] = torch.nn.functional.pad(Z, (0, 0, 0, M - 1)).unsqueeze(-3)
+        share = function.parameters["share"]
+        s, t = function.shift.unbind(-1)
+        values["constant"] = -MEAN_SIZE * (t + share * s).unsqueeze(-1)
+        slope = torch.stack([share, torch.ones_like(share)], -1).unsqueeze(-2)
+        values["slope"] = torch.nn.functional.pad(-MEAN_SIZE * slope, (0, widest - d))
+        values["weight"] = torch.nn.functional.pad(share[..., None, None], (0, M - 1))
+        return HYSTERESIS, values
     if isinstance(function, KnownFunction):
         if d > 1:
             raise invalid(

@@ -1,11 +1,11 @@
-"""Parametric forms of static functions: a step, a root, an edge, a cube.
+"""Parametric forms of static functions: a step, a root, an edge, a cube, a hysteresis.
 
-Each is a `Known` layer of one signal with one or two parameters, for what plants often have in
-feedback.
+Each is a `Known` layer with at most two parameters, for what plants often have in feedback.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Literal
@@ -17,8 +17,7 @@ from torch.nn.functional import softplus
 
 from pyro_dynogp.data.channels import Channel
 from pyro_dynogp.models.arrival import free_delays
-from pyro_dynogp.models.layer import Dynamic, Known, Layer
-from pyro_dynogp.models.wiring import HIDDEN
+from pyro_dynogp.models.layer import HIDDEN, Dynamic, Known, Layer
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 
@@ -30,7 +29,11 @@ ROUNDED, LEAST = 0.1, 1e-4
 # Where a root begins, and an edge lies, by their priors: levels are mostly above the one, and
 # seldom above the other.
 BEGINS, LEVEL = -2.0, 1.0
-FormName = Literal["step", "root", "edge", "cube"]
+# Of the second part of a hysteresis in the first, by its prior.
+SHARE = 0.5
+FormName = Literal["step", "root", "edge", "cube", "hysteresis"]
+# Mean of the absolute value of a standard normal number.
+MEAN_SIZE = math.sqrt(2.0 / math.pi)
 # Parts of each interval between samples in which feedback with a form is computed anew by default.
 SUBSTEPS = 3
 
@@ -58,6 +61,11 @@ def edge(x: Tensor, at: Tensor, width: Tensor) -> Tensor:
 def cube(x: Tensor, at: Tensor) -> Tensor:
     """(x - at)^3."""
     return (x - at) ** 3
+
+
+def hysteresis(v: Tensor, w: Tensor, share: Tensor) -> Tensor:
+    """(|v| - c) w + share v (|w| - c), with c = sqrt(2 / pi)."""
+    return (v.abs() - MEAN_SIZE) * w + share * v * (w.abs() - MEAN_SIZE)
 
 
 class _Priors(FrozenMapping[str, dist.Distribution]):
@@ -88,11 +96,18 @@ def _number(value: float) -> Tensor:
 
 STEP = _Priors("STEP", {"at": _normal(0.0), "width": _width()})
 ROOT = _Priors("ROOT", {"at": _normal(BEGINS)})
+HYSTERESIS = _Priors("HYSTERESIS", {"share": _normal(SHARE)})
 CUBE = _Priors("CUBE", {"at": _normal(0.0)})
 EDGE = _Priors("EDGE", {"at": _normal(LEVEL), "width": _width()})
 # Function and priors of each form.
 FORMS: Mapping[FormName, tuple[Callable[..., Tensor], _Priors]] = MappingProxyType(
-    {"step": (step, STEP), "root": (root, ROOT), "edge": (edge, EDGE), "cube": (cube, CUBE)}
+    {
+        "step": (step, STEP),
+        "root": (root, ROOT),
+        "edge": (edge, EDGE),
+        "cube": (cube, CUBE),
+        "hysteresis": (hysteresis, HYSTERESIS),
+    }
 )
 
 
@@ -103,7 +118,7 @@ def Form(
     sees: tuple[str, ...] = (),
     name: str | None = None,
 ) -> Known:
-    r"""A static layer of one signal x whose function has a given form and one or two parameters.
+    r"""A static layer of one signal x, or of two, whose function has a given form.
 
     - "step": tanh((x - at) / width). In feedback Coulomb's friction, where x is a velocity.
     - "root": the square root of x - at, zero below. The outflow of a tank by Torricelli's law,
@@ -112,17 +127,23 @@ def Form(
     - "edge": x - at, zero below; width log(1 + exp((x - at) / width)). What flows over the edge of
       a tank, a stop that a mass hits, a valve that opens.
     - "cube": (x - at)^3, which contains a square. A spring that hardens or softens.
+    - "hysteresis", of two signals v and w: the two products (\|v\| - c) w and v (\|w\| - c), with
+      c = sqrt(2 / pi), so that they contain no line where both are standard normal. In feedback of
+      hidden signals that are a velocity and a force it makes the Bouc-Wen model,
+      w' = a v - b \|v\| w - d v \|w\|: a spring or a magnet whose force depends on its past.
 
-    A Gaussian process can take the same shapes, but needs many inducing values for an edge, has to
-    learn from the data where a function bends, and keeps its value beyond them. The gains of the
-    layer that sees a form are its size and sign.
+    A Gaussian process of one signal can take the same shapes, but needs many inducing values for an
+    edge, has to learn from the data where a function bends, and keeps its value beyond them. The
+    gains of the layer that sees a form are its size and sign. A hysteresis has two outputs, the
+    others one.
 
     Sites: ``<layer>_at``, normal with mean 0 (step, cube), -2 (root) or 1 (edge) and standard
-    deviation 1; ``<layer>_width``, LogNormal(-2, 1), of a step and of an edge. Inputs and the
-    output are seen as standard deviations from their mean, signals of dynamics as they are.
+    deviation 1; ``<layer>_width``, LogNormal(-2, 1), of a step and of an edge; a hysteresis has
+    none. Inputs and the output are seen as standard deviations from their mean, signals of dynamics
+    as they are.
 
     Args:
-        form: "step", "root", "edge" or "cube".
+        form: "step", "root", "edge", "cube" or "hysteresis".
         skip: names of earlier signals that the layer sees too. sees: those that it sees instead.
         name: prefix of its sites; f, or f1, f2, ... by default.
 
@@ -132,16 +153,26 @@ def Form(
     Raises:
         ValueError: on an unknown form.
 
+    Source of the Bouc-Wen model: Y.-K. Wen, Method for random vibration of hysteretic systems,
+    Journal of the Engineering Mechanics Division 102, 1976.
+
     Examples:
         >>> sorted(dgp.Form("edge", sees=("g_hidden",)).parameters)
         ['at', 'width']
-        >>> sorted(Form("root").parameters)
-        ['at']
+        >>> mass = dgp.Dynamic(pairs=2, hidden=2, feedback=("past",), name="mass")
+        >>> past = dgp.Form("hysteresis", sees=("mass_hidden",), name="past")
+        >>> dgp.Cascade(1, (mass, past), output="mass").wires[1].layer.outputs
+        2
     """
     if not isinstance(form, str) or form not in FORMS:
         expected = ", ".join(repr(known) for known in FORMS)
         raise invalid("form", expected=f"one of {expected}", got=repr(form))
     function, priors = FORMS[form]
+    if form == "hysteresis":
+        return Known(
+            function, priors, range=(-math.inf, math.inf), scaled=True, skip=skip,
+            sees=sees, name=name,
+        )  # fmt: skip
     return Known(function, priors, scaled=True, skip=skip, sees=sees, name=name)
 
 
@@ -169,7 +200,11 @@ def form_of(layer: Layer) -> FormName | None:
     return next((form for form, (f, _) in FORMS.items() if layer.function is f), None)
 
 
-def smooth_and_hidden(layers: Sequence[Layer]) -> bool:
-    """Whether all static layers are smooth, beside a signal of dynamics that nothing measures."""
+def have_no_place(layers: Sequence[Layer]) -> bool:
+    """Whether functions have no place, beside signals of dynamics that nothing measures.
+
+    Smooth functions and a hysteresis have none; a step, a root and an edge lie somewhere.
+    """
     hidden = any(isinstance(layer, Dynamic) and layer.hidden for layer in layers)
-    return hidden and not any(isinstance(layer, Known) for layer in layers)
+    known = [layer for layer in layers if isinstance(layer, Known)]
+    return hidden and all(layer.function is hysteresis for layer in known)

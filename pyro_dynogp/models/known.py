@@ -20,6 +20,7 @@ from torch import Tensor
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.layers.functions import even_grid
 from pyro_dynogp.layers.sites import Site, Values
+from pyro_dynogp.models.forms import form_of
 from pyro_dynogp.models.layer import in_double
 from pyro_dynogp.models.product import is_product
 from pyro_dynogp.models.structure import Structure
@@ -157,7 +158,7 @@ def known_function(
     zero = torch.zeros(layer.outputs, dtype=torch.float64)
     name = f"layer {place.name!r}"
     f = KnownFunction(layer.function, parameters, shift, scale_, ends, zero, zero + 1.0, name)
-    if (place.last and layer.scaled) or is_product(layer):
+    if (place.last and layer.scaled) or is_product(layer) or form_of(layer) == "hysteresis":
         return f
     if place.last:
         level, size = as_tensor(scaling.output_offset), as_tensor(scaling.output_scale)

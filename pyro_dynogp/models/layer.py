@@ -15,6 +15,8 @@ from pyro_dynogp.layers.kernels import RESOLVED, ROUGH, SMOOTH
 from pyro_dynogp.lti.modes import NoiseStructure
 from pyro_dynogp.support.errors import invalid
 
+# What follows a layer's name in that of its hidden signals.
+HIDDEN = "_hidden"
 # Lowest and highest value, None where there is none.
 Limits = tuple[float | None, float | None]
 

@@ -8,6 +8,7 @@ from dataclasses import fields
 from numbers import Real
 
 from pyro_dynogp.layers.kernels import KernelPrior
+from pyro_dynogp.models.forms import form_of
 from pyro_dynogp.models.layer import Dynamic, Known, Layer, Static, in_double
 from pyro_dynogp.models.product import factors
 from pyro_dynogp.support.errors import COUNT, RULES, instance, invalid
@@ -57,8 +58,8 @@ def _check_real(name: str, layer: Dynamic) -> None:
         )
 
 
-def check_product(name: str, layer: Layer, channels: int) -> None:
-    """Refuse a product of another number of signals than it sees."""
+def check_signals(name: str, layer: Layer, channels: int) -> None:
+    """Refuse a product, or a form, of another number of signals than it sees."""
     first = factors(layer)
     if first and channels != first + layer.outputs // first:
         raise invalid(
@@ -66,6 +67,14 @@ def check_product(name: str, layer: Layer, channels: int) -> None:
             expected=f"{first} signals that come first and {layer.outputs // first} others",
             got=f"{channels} signals",
         )
+    form = form_of(layer)
+    needed = {None: channels, "hysteresis": 2}.get(form, 1)
+    if channels != needed:
+        raise invalid(
+            f"layer {name!r}",
+            expected=f"{needed} signals for the form {form!r}", got=f"{channels} signals",
+            advice="sees names them: outputs of layers, or hidden signals of a dynamic layer.",
+        )  # fmt: skip
 
 
 def check_limits(name: str, layer: Static, channels: int, last: bool) -> None:

@@ -3,31 +3,23 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 from pyro_dynogp.data.channels import Channel, count_direct
 from pyro_dynogp.layers.noise import Likelihood
-from pyro_dynogp.models.forms import Form, form_of, forms_of, usual_substeps
-from pyro_dynogp.models.layer import INDUCING, fed_back
+from pyro_dynogp.models.layer import INDUCING
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.product import Product, factors, is_product
+from pyro_dynogp.models.product import Product, factors
 from pyro_dynogp.models.wiring import (
-    HIDDEN,
     INPUTS,
     Dynamic,
-    Known,
     Layer,
     Limits,
     Static,
     StaticLayer,
     Wire,
 )
-
-# Names of functions that act back: of a layer's output, and of a signal of it that is hidden, and
-# of a step of the latter, and products of inputs with the output or with the hidden signal.
-FEEDBACK, HIDDEN_FEEDBACK, STEP = "feedback", "hidden_feedback", "feedback_step"
-PRODUCT, HIDDEN_PRODUCT = "feedback_product", "hidden_product"
 
 
 def with_channel(model: Model, channel: Channel) -> Model:
@@ -187,123 +179,6 @@ def with_input_function(model: Model) -> Model | None:
         return None
     first = Static(outputs=driving, inducing=INDUCING)
     return replace(model, layers=(first, *model.layers), scaling=None, output=None)
-
-
-def with_feedback(
-    model: Model, *, output: bool = True, hidden: bool = False, step: bool = True
-) -> Model | None:
-    """The model with static layers that see its last dynamic layer and act back on it.
-
-    Static layers may follow that layer: they are what measures it. None where there is nothing to
-    add, with feedback to another layer, and under noise that feedback does not allow.
-
-    Args:
-        model: to extend. output: whether one function sees the output of the layer.
-        hidden: whether one sees a further signal of the same states, which nothing measures.
-        step: whether a step of that comes back as well.
-    """
-    if not model.dynamic:
-        return None
-    seen, layer = model.dynamic[-1]
-    own, unseen = (seen.name,), (seen.name + HIDDEN,)
-    back: list[Static | Known] = []
-    if output:
-        back.append(fed_back(layer.outputs, sees=own, name=FEEDBACK))
-    if hidden:
-        back.append(fed_back(1, sees=unseen, name=HIDDEN_FEEDBACK))
-        back += [Form("step", sees=unseen, name=STEP)] if step else []
-    return _fed_back(model, back, hidden=hidden)
-
-
-def with_forms(model: Model, *, hidden: bool = False) -> Model | None:
-    """The model with parametric forms of its last dynamic layer that act back on it.
-
-    None for several outputs or hidden signals, and where `with_feedback` is None.
-
-    Args:
-        model: to extend. hidden: whether some see a further signal of the same states, which
-            nothing measures; see `forms_of`.
-    """
-    if not model.dynamic:
-        return None
-    seen, layer = model.dynamic[-1]
-    if layer.outputs > 1 or layer.hidden > 1:
-        return None
-    return _fed_back(model, forms_of(seen.name, hidden=hidden), hidden=hidden)
-
-
-def with_products(model: Model, *, hidden: bool = False) -> Model | None:
-    """The model with products of inputs and its last dynamic layer's output that act back on it.
-
-    None without inputs, and where `with_feedback` is None.
-
-    Args:
-        model: to extend. hidden: whether inputs multiply a further signal of the same states, which
-            nothing measures, in place of the output.
-    """
-    driving = model.inputs - model.direct
-    if not model.dynamic or not driving:
-        return None
-    seen, layer = model.dynamic[-1]
-    other, count = seen.name, layer.outputs
-    if hidden:
-        other, count = seen.name + HIDDEN, max(layer.hidden, 1)
-    name = HIDDEN_PRODUCT if hidden else PRODUCT
-    extended = _fed_back(
-        model, [Product(driving, count, sees=(INPUTS, other), name=name)], hidden=hidden
-    )
-    return None if extended is None else with_usual_substeps(extended)
-
-
-def noise_allows_feedback(model: Model) -> bool:
-    """Whether functions may be put in feedback beside the model's measurement noise."""
-    return model.likelihood.gaussian and not model.likelihood.follows_output
-
-
-def _fed_back(model: Model, given: Sequence[Static | Known], *, hidden: bool) -> Model | None:
-    """The model with functions that act back on its last dynamic layer, but those that do.
-
-    Args:
-        hidden: whether one sees a signal that nothing measures.
-    """
-    seen, layer = model.dynamic[-1]
-    if not noise_allows_feedback(model) or (hidden and layer.real):
-        return None
-    sources = {wire.name: wire.sources for wire in model.wires}
-    before = {sources[name] for name in layer.feedback}
-    back = [one for one in given if one.sees not in before]
-    if not back or (model.has_feedback and not layer.feedback):
-        return None
-    names = (*layer.feedback, *(str(one.name) for one in back))
-    layers: list[Layer] = []
-    for wire, other in zip(model.wires, model.layers, strict=True):
-        sees = () if wire.sources == (INPUTS,) and not layers else wire.sources
-        if isinstance(other, Dynamic) and wire.name == seen.name:
-            other = replace(other, feedback=names, hidden=max(layer.hidden, int(hidden)))
-        layers.append(replace(other, name=wire.name, sees=sees, skip=()))
-        layers += back if wire.name == seen.name else []
-    return replace(
-        model, layers=tuple(layers), scaling=None, output=model.output_wire.name, integrate="all"
-    )
-
-
-def with_usual_substeps(model: Model, base: Model | None = None) -> Model:
-    """The model with feedback computed as often between samples as is usual for what is in it.
-
-    As it is where it extends a base that has fewer: whoever made that one wants it so.
-    """
-    if base is not None and with_usual_substeps(base) != base:
-        return model
-
-    def finer(_: Wire, layer: Dynamic) -> Dynamic:
-        forms = any(
-            w.name in layer.feedback and (form_of(w.layer) is not None or is_product(w.layer))
-            for w in model.wires
-        )
-        parts = usual_substeps(model.channels, forms=forms)
-        return replace(layer, substeps=max(layer.substeps, parts))
-
-    return with_dynamics(model, finer)
 
 
 def have_same_parameters(model: Model, other: Model) -> bool:

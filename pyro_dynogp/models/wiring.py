@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from pyro_dynogp.models.layer import HIDDEN as HIDDEN
 from pyro_dynogp.models.layer import Dynamic as Dynamic
 from pyro_dynogp.models.layer import Known as Known
 from pyro_dynogp.models.layer import Layer as Layer
 from pyro_dynogp.models.layer import Limits as Limits
 from pyro_dynogp.models.layer import Static as Static
 from pyro_dynogp.models.layer import StaticLayer as StaticLayer
-from pyro_dynogp.models.layer_rules import check_layer, check_limits, check_product
+from pyro_dynogp.models.layer_rules import check_layer, check_limits, check_signals
 from pyro_dynogp.support.errors import instance, invalid, whole
 
 INPUTS = "inputs"
-# What follows a layer's name in that of its hidden signals.
-HIDDEN = "_hidden"
 # Most parts of an interval between samples.
 MOST_SUBSTEPS = 64
 
@@ -109,7 +108,7 @@ def wire(inputs: int, layers: Sequence[Layer], output: str | None = None) -> tup
             raise invalid(
                 f"layer {name!r}", expected="inputs for a static layer", got="no channels"
             )
-        check_product(name, layer, channels)
+        check_signals(name, layer, channels)
         if isinstance(layer, Static):
             looped = name in back and channels > 1
             linear = place == 0 or looped or layer.limits is not None

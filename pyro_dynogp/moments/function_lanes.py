@@ -7,8 +7,19 @@ import math
 import numpy as np
 from numba import njit
 
-from pyro_dynogp.lti.lanes import WIDTH, below, choose, exponential, gather, get, put, root, splat
-from pyro_dynogp.moments.functions import PRODUCT
+from pyro_dynogp.lti.lanes import (
+    WIDTH,
+    below,
+    choose,
+    exponential,
+    gather,
+    get,
+    magnitude,
+    put,
+    root,
+    splat,
+)
+from pyro_dynogp.moments.functions import HYSTERESIS, PRODUCT
 from pyro_dynogp.support.compiled import BORROWING, WITHIN
 
 # Number of each point.
@@ -91,6 +102,12 @@ def expand(form, i, d, e, f0, first, values, z, f):
         put(f, first + a, total)
     if form > PRODUCT:
         add_products(form - PRODUCT, d, first, z, f)
+        return
+    if form == HYSTERESIS:
+        v = get(z, 0) - get(values.Z, i * M * most)
+        w = get(z, 1) - get(values.Z, i * M * most + 1)
+        share = get(values.weight, f0 * M)
+        put(f, first, get(f, first) + magnitude(v) * w + share * v * magnitude(w))
         return
     for m in range(M):
         square = splat(0.0)

@@ -9,7 +9,11 @@ table is computed outside. A function of several channels is an expansion in a r
 
 or the products of each of its first k channels with each other one, form PRODUCT + k,
 
-    f_(i, j)(z) = constant_(i, j) + slope_(i, j) . z + z_i z_(k + j).
+    f_(i, j)(z) = constant_(i, j) + slope_(i, j) . z + z_i z_(k + j),
+
+or, form HYSTERESIS, with v = z_1 - Z_11 and w = z_2 - Z_12,
+
+    f(z) = constant + slope . z + |v| w + weight_11 v |w|.
 """
 
 from __future__ import annotations
@@ -26,6 +30,7 @@ from pyro_dynogp.support.compiled import BORROWING
 # Forms of a static function.
 TABLE = 0
 KERNELS = {"rbf": 1, "matern12": 2, "matern32": 3, "matern52": 4}
+HYSTERESIS = 7
 PRODUCT = 8
 
 
@@ -141,6 +146,29 @@ def products_adjoint(first, z, f_bar, z_bar):
 
 
 @njit(**BORROWING)
+def add_hysteresis(z, part, f):
+    """Add |v| w and a share of v |w| to f (1,); v and w are z (2,) less the first location."""
+    v = z[0] - part.Z[0, 0]
+    w = z[1] - part.Z[0, 1]
+    f[0] += abs(v) * w + part.weight[0, 0] * v * abs(w)
+
+
+@njit(**BORROWING)
+def hysteresis_adjoint(z, part, f_bar, z_bar, bars):
+    """Add the gradients by z, by the first location and by the share, given f_bar."""
+    v = z[0] - part.Z[0, 0]
+    w = z[1] - part.Z[0, 1]
+    share = part.weight[0, 0]
+    by_v = f_bar[0] * (np.sign(v) * w + share * abs(w))
+    by_w = f_bar[0] * (abs(v) + share * v * np.sign(w))
+    z_bar[0] += by_v
+    z_bar[1] += by_w
+    bars.Z[0, 0] -= by_v
+    bars.Z[0, 1] -= by_w
+    bars.weight[0, 0] += f_bar[0] * v * abs(w)
+
+
+@njit(**BORROWING)
 def expansion(form, z, part, f):
     """Write the outputs f (e,) of a radial expansion, or of products, at z (d,)."""
     e = f.shape[0]
@@ -151,6 +179,9 @@ def expansion(form, z, part, f):
             f[a] += part.slope[a, c] * z[c]
     if form > PRODUCT:
         add_products(form - PRODUCT, z, f)
+        return
+    if form == HYSTERESIS:
+        add_hysteresis(z, part, f)
         return
     for m in range(part.Z.shape[0]):
         square = 0.0
@@ -175,6 +206,9 @@ def expansion_adjoint(form, z, part, f_bar, z_bar, bars):
             z_bar[c] += f_bar[a] * part.slope[a, c]
     if form > PRODUCT:
         products_adjoint(form - PRODUCT, z, f_bar, z_bar)
+        return
+    if form == HYSTERESIS:
+        hysteresis_adjoint(z, part, f_bar, z_bar, bars)
         return
     for m in range(part.Z.shape[0]):
         square = 0.0

@@ -20,8 +20,9 @@ from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.inference.refit import WARMUP, family_of, refit
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
+from pyro_dynogp.models.feedback_variants import with_usual_substeps
 from pyro_dynogp.models.model import Model
-from pyro_dynogp.models.variants import used_channels, with_usual_substeps
+from pyro_dynogp.models.variants import used_channels
 from pyro_dynogp.report.last_block import report_of
 from pyro_dynogp.report.report import Report
 from pyro_dynogp.statistics.settings import LoopSettings

@@ -49,6 +49,13 @@ def tanks(seed: int, noise: float) -> FeedbackSimulation:
     return simulate_tanks(seed, overflow=seed % 2 == 1, noise_ratio=noise)
 
 
+def hysteretic() -> dgp.Model:
+    """Two pairs of poles, and a hysteresis of two hidden signals of theirs."""
+    mass = dgp.Dynamic(pairs=2, hidden=2, feedback=("past",), substeps=3, name="mass")
+    past = dgp.Form("hysteresis", sees=("mass_hidden",), name="past")
+    return dgp.Cascade(1, (mass, past), output="mass")
+
+
 # What is simulated, and the model of its structure.
 KINDS: Mapping[str, tuple[Simulator, Maker]] = {
     "Duffing": (
@@ -63,7 +70,7 @@ KINDS: Mapping[str, tuple[Simulator, Maker]] = {
     ),
     "Bouc-Wen": (
         lambda seed, noise: simulate_bouc_wen(seed, noise_ratio=noise),
-        lambda: dgp.NonlinearFeedback(1, pairs=2, hidden=1),
+        hysteretic,
     ),
 }
 

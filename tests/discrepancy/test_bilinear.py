@@ -13,7 +13,7 @@ from pyro_dynogp.effects import bilinear
 from pyro_dynogp.effects.base import centre_of
 from pyro_dynogp.effects.bilinear import with_products_of_inputs
 from pyro_dynogp.effects.nonlinear_feedback import NonlinearFeedbackOfOutput, nonlinear_feedback
-from pyro_dynogp.models.variants import with_products
+from pyro_dynogp.models.feedback_variants import with_products
 from tests.discrepancy.made import SETTINGS
 from tests.effects.test_nonlinear_feedback import carried
 

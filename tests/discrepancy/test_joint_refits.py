@@ -17,7 +17,8 @@ from pyro_dynogp.discrepancy.judged import Judged, judge, kind_of
 from pyro_dynogp.discrepancy.refits import Refits
 from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.discrepancy.trials import Tried
-from pyro_dynogp.models.variants import with_channel, with_feedback
+from pyro_dynogp.models.feedback_variants import with_feedback
+from pyro_dynogp.models.variants import with_channel
 from pyro_dynogp.statistics.evidence import Evidence
 from tests.discrepancy.made import SETTINGS
 

@@ -16,7 +16,7 @@ from pyro_dynogp.inference.refit import refit
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.plans import starting_points
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
-from pyro_dynogp.models.variants import with_feedback
+from pyro_dynogp.models.feedback_variants import with_feedback
 from pyro_dynogp.prediction.predict import runs_after
 from pyro_dynogp.statistics.settings import LoopSettings
 from tests.benchmarks.textbook import plant

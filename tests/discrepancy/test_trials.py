@@ -21,9 +21,9 @@ from pyro_dynogp.inference.refit import refit
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.extended import extended_starts
 from pyro_dynogp.inference.starts.poles import grown
+from pyro_dynogp.models.feedback_variants import with_feedback
 from pyro_dynogp.models.variants import (
     with_channel,
-    with_feedback,
     with_input_function,
     with_output_function,
     with_pairs,
@@ -183,6 +183,7 @@ def refitted_by(monkeypatch, again, noise=False):
         return np.full(9, fit.level / 9)
 
     monkeypatch.setattr(trials, "refit", again)
+    monkeypatch.setattr(refits, "refit", again)
     monkeypatch.setattr(trials, "held_out_density", density)
     monkeypatch.setattr(trials, "scored", lambda fit, *_: (density(fit), np.zeros((9, 1))))
     monkeypatch.setattr(trials, "_are_noise", lambda errors, fit: noise)
@@ -267,33 +268,35 @@ def test_both_functions_together_are_fitted_where_one_of_them_helps_and_leaves_s
 @pytest.mark.parametrize(
     ("levels", "noise", "fitted"),
     [
-        ((5.0, 9.0, 7.0, 8.0, 6.0, 6.0, 6.0, 6.0, 9.0), (), 9),
-        # Products, a step, forms and compartments are tried whatever functions do.
-        ((-3.0, 1.0, -2.0, -3.0, -3.0, -3.0, -3.0, -3.0, 9.0), (), 9),
+        ((5.0, 9.0, 7.0, 8.0, 6.0, 6.0, 6.0, 6.0, 6.0, 9.0), (), 10),
+        # Products, a step, forms, compartments and a hysteresis are tried whatever functions do.
+        ((-3.0, 1.0, -2.0, -3.0, -3.0, -3.0, -3.0, -3.0, -3.0, 9.0), (), 10),
         # Both functions are not where nothing helps,
-        ((-3.0, -1.0, -2.0, -3.0, -3.0, -3.0, -3.0, -3.0, 9.0), (), 8),
-        ((-3.0, 1.0, -2.0, 3.0, -3.0, -3.0, -3.0, -3.0, 9.0), (), 8),  # nor where products lead
-        ((-3.0, 1.0, -2.0, -3.0, -3.0, 3.0, -3.0, -3.0, 9.0), (), 8),  # nor where forms do
-        ((-3.0, 1.0, -2.0, -3.0, -3.0, -3.0, -3.0, 3.0, 9.0), (), 8),  # nor where compartments do
+        ((-3.0, -1.0, -2.0, -3.0, -3.0, -3.0, -3.0, -3.0, -3.0, 9.0), (), 9),
+        # nor where products lead, nor forms, nor compartments, nor a hysteresis,
+        ((-3.0, 1.0, -2.0, 3.0, -3.0, -3.0, -3.0, -3.0, -3.0, 9.0), (), 9),
+        ((-3.0, 1.0, -2.0, -3.0, -3.0, 3.0, -3.0, -3.0, -3.0, 9.0), (), 9),
+        ((-3.0, 1.0, -2.0, -3.0, -3.0, -3.0, -3.0, 3.0, -3.0, 9.0), (), 9),
+        ((-3.0, 1.0, -2.0, -3.0, -3.0, -3.0, -3.0, -3.0, 3.0, 9.0), (), 9),
         # but where a step does.
-        ((-3.0, 1.0, -2.0, -3.0, 3.0, -3.0, -3.0, -3.0, 9.0), (), 9),
+        ((-3.0, 1.0, -2.0, -3.0, 3.0, -3.0, -3.0, -3.0, -3.0, 9.0), (), 10),
         # The rest is not beside noise alone, nor a step, nor forms, nor compartments,
-        ((5.0, 9.0, 20.0, 8.0, 6.0, 6.0, 6.0, 6.0, 9.0), (20.0,), 3),
-        ((5.0, 9.0, 7.0, 8.0, 20.0, 6.0, 6.0, 6.0, 9.0), (20.0,), 5),
-        ((5.0, 9.0, 7.0, 8.0, 6.0, 20.0, 6.0, 6.0, 9.0), (20.0,), 6),
-        ((5.0, 9.0, 7.0, 8.0, 6.0, 6.0, 20.0, 6.0, 9.0), (20.0,), 7),
+        ((5.0, 9.0, 20.0, 8.0, 6.0, 6.0, 6.0, 6.0, 6.0, 9.0), (20.0,), 3),
+        ((5.0, 9.0, 7.0, 8.0, 20.0, 6.0, 6.0, 6.0, 6.0, 9.0), (20.0,), 5),
+        ((5.0, 9.0, 7.0, 8.0, 6.0, 20.0, 6.0, 6.0, 6.0, 9.0), (20.0,), 6),
+        ((5.0, 9.0, 7.0, 8.0, 6.0, 6.0, 20.0, 6.0, 6.0, 9.0), (20.0,), 7),
         # unless another one forecasts better.
-        ((5.0, 9.0, 7.0, 8.0, 6.0, 6.0, 6.0, 6.0, 9.0), (7.0,), 9),
-        ((5.0, 9.0, 7.0, 8.0, 6.0, 6.0, 6.0, 6.0, 9.0), (9.0,), 2),
+        ((5.0, 9.0, 7.0, 8.0, 6.0, 6.0, 6.0, 6.0, 6.0, 9.0), (7.0,), 10),
+        ((5.0, 9.0, 7.0, 8.0, 6.0, 6.0, 6.0, 6.0, 6.0, 9.0), (9.0,), 2),
     ],
 )
 def test_later_variants_are_fitted_one_by_one_while_something_is_left(
     record, monkeypatch, levels, noise, fitted
 ):
-    plain = dgp.LinearDynamicGP(1, pairs=1)
+    plain = dgp.LinearDynamicGP(1, pairs=2)
     said = SimpleNamespace(where={"output": "y", "products": 0.9})
     models = tuple(NonlinearFeedbackOfOutput().extend(plain, said, record))
-    assert len(models) == 9
+    assert len(models) == 10
     made = []
 
     def again(fit, training, *, model, run):
@@ -307,6 +310,31 @@ def test_later_variants_are_fitted_one_by_one_while_something_is_left(
                          compared="held out")  # fmt: skip
     trials.run(trial)
     assert [one.model for one in made] == list(models[:fitted])
+
+
+@pytest.mark.parametrize("compared", ["held out", "rehearsed"])
+@pytest.mark.parametrize(
+    ("failing", "kept"), [((), 2), ((0,), 2), ((0, 1), 2), ((2,), 0), ((0, 1, 2), None)]
+)
+def test_variants_that_cannot_be_fitted_are_left_out(record, monkeypatch, failing, kept, compared):
+    plain = dgp.LinearDynamicGP(1, pairs=1)
+    models = (with_feedback(plain), with_feedback(plain, output=False, hidden=True, step=False),
+              with_feedback(plain, output=False, hidden=True))  # fmt: skip
+
+    def again(fit, training, *, model, run):
+        place = models.index(model)
+        if place in failing:
+            raise ValueError(f"variant {place} diverges. Take another one.")
+        return Made(model, (5.0, 0.0, 9.0)[place], records=(record,))
+
+    refitted_by(monkeypatch, again)
+    monkeypatch.setattr(trials, "lasting", lambda fits, *_: fits)
+    fold = np.arange(N) >= TRAINING
+    trial = trials.Trial(models, record, (fold,), Made(plain, 0.0), 0, SETTINGS, compared=compared)
+    tried = trials.run(trial)
+    assert tried.failure == ("variant 0 diverges" if kept is None else "")
+    assert tried.model == models[kept or 0]
+    assert (tried.fit is None) == (kept is None)
 
 
 @pytest.mark.parametrize(

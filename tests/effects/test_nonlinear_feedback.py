@@ -17,8 +17,9 @@ from pyro_dynogp.effects.nonlinear_feedback import (
     nonlinear_feedback,
 )
 from pyro_dynogp.effects.output_nonlinearity import output_nonlinearity
+from pyro_dynogp.models.feedback_variants import with_feedback, with_products
 from pyro_dynogp.models.system import DynamicSystem
-from pyro_dynogp.models.variants import with_channel, with_feedback, with_products
+from pyro_dynogp.models.variants import with_channel
 from tests.discrepancy.made import SETTINGS, coloured, residuals_of, within_chance
 from tests.models.closed_loops import make_record
 from tests.models.test_known import values_at

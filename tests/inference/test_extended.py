@@ -15,10 +15,10 @@ from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.extended import extended_starts
 from pyro_dynogp.inference.starts.plans import starting_points
+from pyro_dynogp.models.feedback_variants import with_feedback
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.variants import (
     with_channel,
-    with_feedback,
     with_input_function,
     with_integrator,
     with_likelihood,

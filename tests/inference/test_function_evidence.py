@@ -30,7 +30,7 @@ from pyro_dynogp.inference.optimise.optimum import Optimum
 from pyro_dynogp.inference.refit import refit
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.plans import starting_points
-from pyro_dynogp.models.variants import with_feedback
+from pyro_dynogp.models.feedback_variants import with_feedback
 
 ALONE = Run(workers=1)
 PLANT = simulate_duffing(0, noise_ratio=0.02)

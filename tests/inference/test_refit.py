@@ -14,7 +14,8 @@ from pyro_dynogp.inference.function_evidence import kernel_sites
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.refit import optima_of, refit
 from pyro_dynogp.inference.run import Run
-from pyro_dynogp.models.variants import with_channel, with_feedback
+from pyro_dynogp.models.feedback_variants import with_feedback
+from pyro_dynogp.models.variants import with_channel
 from tests.inference.cascades import FAST, wiener
 from tests.models.closed_loops import make_record
 

@@ -21,7 +21,7 @@ from pyro_dynogp.layers.static import (
     starting_locations,
     static_gp,
 )
-from pyro_dynogp.models.variants import with_feedback
+from pyro_dynogp.models.feedback_variants import with_feedback
 from tests.layers.dense import Dense, close, draw, normal, values
 
 SITES = (

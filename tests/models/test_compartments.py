@@ -19,9 +19,10 @@ from pyro_dynogp.lti.covariance import stationary_variance
 from pyro_dynogp.lti.views import steady_state_gain
 from pyro_dynogp.models.compartments import in_place_of
 from pyro_dynogp.models.description import describe
+from pyro_dynogp.models.feedback_variants import with_feedback, with_forms, with_products
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.priors import LASTING, SETTLING, ModesPrior
-from pyro_dynogp.models.variants import with_feedback, with_forms, with_integrator, with_products
+from pyro_dynogp.models.variants import with_integrator
 from pyro_dynogp.support.frozen import FrozenMapping
 from tests.models.closed_loops import check_gradient, make_record, system_at
 from tests.models.test_forms import MIDDLE, PLAIN

@@ -13,9 +13,9 @@ import pyro_dynogp as dgp
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.free_runs import noise_sites
 from pyro_dynogp.inference.starts.plans import Plan, plans, starting_point
+from pyro_dynogp.models.feedback_variants import with_feedback, with_forms, with_usual_substeps
 from pyro_dynogp.models.forms import form_of
 from pyro_dynogp.models.outputs import output_process
-from pyro_dynogp.models.variants import with_feedback, with_forms, with_usual_substeps
 from tests.models.closed_loops import check_gradient, make_record, system_at
 from tests.models.test_known import values_at
 
@@ -128,7 +128,8 @@ def test_other_functions_are_no_forms():
     assert form_of(dgp.Known(lambda x, at: x - at, {"at": dist.Normal(0.0, 1.0)})) is None
     assert form_of(dgp.Static()) is None
     with pytest.raises(
-        ValueError, match="form: expected one of 'step', 'root', 'edge', 'cube', got 'square"
+        ValueError,
+        match="form: expected one of 'step', 'root', 'edge', 'cube', 'hysteresis', got 'square",
     ):
         dgp.Form("square")
     with pytest.raises(AttributeError, match=r"it is now pyro_dynogp\.models\.forms\.Form"):

@@ -12,14 +12,10 @@ import pyro_dynogp as dgp
 from pyro_dynogp.data.channels import DeadZone, Recorded, Trend
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.starts.extended import extended_starts
+from pyro_dynogp.models.feedback_variants import with_feedback, with_products
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.product import Products, factors, is_product
-from pyro_dynogp.models.variants import (
-    with_channel,
-    with_feedback,
-    with_products,
-    without_channel,
-)
+from pyro_dynogp.models.variants import with_channel, without_channel
 from tests.models.closed_loops import ClosedLoop, check_gradient, make_record, system_at
 from tests.models.test_known import values_at as any_values_at
 

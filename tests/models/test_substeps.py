@@ -14,10 +14,11 @@ from pyro_dynogp.inference.free_runs import free_run_error
 from pyro_dynogp.inference.optimise.maximum import maximise
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.lti.grid import time_grid
+from pyro_dynogp.models.feedback_variants import with_feedback, with_usual_substeps
 from pyro_dynogp.models.moment_outputs import quiet_last_steps
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.prepared import PreparedRecord
-from pyro_dynogp.models.variants import have_same_parameters, with_feedback, with_usual_substeps
+from pyro_dynogp.models.variants import have_same_parameters
 from tests.models.closed_loops import (
     check_gradient,
     make_record,

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import pyro_dynogp as dgp
 from pyro_dynogp.data.channels import DeadZone, Play, Recorded, Trend
-from pyro_dynogp.models.variants import with_channel, with_channels_of, with_feedback, with_pairs
+from pyro_dynogp.models.feedback_variants import with_feedback
+from pyro_dynogp.models.variants import with_channel, with_channels_of, with_pairs
 
 BASE = with_channel(dgp.LinearDynamicGP(1, pairs=1), Recorded("w"))
 ZONE, LINE = DeadZone("u", -1.0, 1.0), Trend(0.0, 9.0)

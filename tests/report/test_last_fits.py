@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import pytest
 
 import pyro_dynogp as dgp
+from pyro_dynogp.models.feedback_variants import with_feedback, with_usual_substeps
 from pyro_dynogp.models.forms import SUBSTEPS
-from pyro_dynogp.models.variants import with_feedback, with_usual_substeps
 from pyro_dynogp.report import loop
 
 

@@ -21,6 +21,8 @@ from pyro_dynogp.support.tensors import at_places
 Values = dict[str, Tensor]
 # Size of gains that are there to be learnt.
 SMALL = 0.05
+# Size of gains of signals beside the first, and of hidden ones beside what they begin as.
+OTHERS, AROUND = 0.7, 0.3
 # Sites of integrators, a row for each output.
 INTEGRATORS = ("integrator_gain", "integrator_drift", "integrator_noise")
 # Standard deviation of the logarithms by which poles are moved for a layer beside another.
@@ -130,7 +132,7 @@ class DynamicStart:
             own = own / own.square().sum((0, -1), keepdim=True).sqrt()
         rest = layer.width - known
         # Drawn for all, so that a signal's gains do not depend on how many are known.
-        gain = torch.cat([own, self._random(layer.width, P, 2, scale=0.7)[known:]])
+        gain = torch.cat([own, self._random(layer.width, P, 2, scale=OTHERS)[known:]])
         if layer.hidden:
             measured = own[self._signals[0] if known > 1 else 0]
             gain[-layer.hidden :] = self._hidden(values, measured, ahead)
@@ -149,18 +151,23 @@ class DynamicStart:
         return found
 
     def _hidden(self, values: Values, measured: Tensor, ahead: bool) -> Tensor:
-        """Gains (P, 2) of an output's derivative by time, over the middle of the poles' sizes.
+        """Gains (h, P, 2) of an output's derivative by time, over the middle of the poles' sizes.
 
-        That is a velocity where a position is measured. `ahead`: with the output itself added, the
-        signal is that of a first-order lag before: a level in the tank above.
+        That is a velocity where a position is measured. `ahead`, of one signal: with the output
+        itself added, it is that of a first-order lag before: a level in the tank above. Of several
+        the first is the derivative, and others are about the output itself, as a force that the
+        position makes.
 
         Args:
             measured: (P, 2), gains of the output: real and imaginary part.
         """
         decay, frequency = (values[self._key(x)].exp() for x in ("log_decay", "log_frequency"))
         pole = torch.complex(-decay, frequency)
-        share = pole / pole.abs().median() + float(ahead)
-        return torch.view_as_real(share * torch.view_as_complex(measured.contiguous()))
+        count = self.layer.hidden
+        share = pole / pole.abs().median() + float(ahead and count == 1)
+        derivative = torch.view_as_real(share * torch.view_as_complex(measured.contiguous()))
+        others = measured + self._random(count - 1, *measured.shape, scale=AROUND)
+        return torch.cat([derivative.unsqueeze(0), others])
 
     def _fed_back(self, gain: Tensor) -> Tensor:
         """Gains (P, d + fed, 2): what comes back acts somewhat as the inputs do, sign at random.
@@ -209,7 +216,7 @@ class DynamicStart:
         if d + self.one.fed:
             values[self._key("input_gain")] = in_place(gain.mT, self._inputs).mT
         if several:
-            gain = self._random(layer.width, P, 2, scale=0.7)
+            gain = self._random(layer.width, P, 2, scale=OTHERS)
             gain[0] = gain[0] + torch.tensor([1.0, 0.0], dtype=torch.float64)
             values[self._key("output_gain")] = in_place(gain.movedim(0, -1), self._signals).movedim(
                 -1, 0
