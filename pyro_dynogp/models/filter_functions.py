@@ -119,15 +119,7 @@ def _function(block: Block, M: int, widest: int) -> tuple[int, dict[str, Tensor]
         _check_known_first(block, function.name, function.function.first)
         return PRODUCT + function.function.first, values | _shifted(function, widest)
     if isinstance(function, KnownFunction) and function.function is hysteresis:
-        Z = torch.nn.functional.pad(-function.shift, (0, widest - d)).unsqueeze(-2)
-        values["Z"] = torch.nn.functional.pad(Z, (0, 0, 0, M - 1)).unsqueeze(-3)
-        share = function.parameters["share"]
-        s, t = function.shift.unbind(-1)
-        values["constant"] = -MEAN_SIZE * (t + share * s).unsqueeze(-1)
-        slope = torch.stack([share, torch.ones_like(share)], -1).unsqueeze(-2)
-        values["slope"] = torch.nn.functional.pad(-MEAN_SIZE * slope, (0, widest - d))
-        values["weight"] = torch.nn.functional.pad(share[..., None, None], (0, M - 1))
-        return HYSTERESIS, values
+        return HYSTERESIS, values | _hysteretic(function, M, widest)
     if isinstance(function, KnownFunction):
         if d > 1:
             raise invalid(
@@ -204,6 +196,21 @@ def _shifted(function: KnownFunction, widest: int) -> dict[str, Tensor]:
     ]
     constant = (s.unsqueeze(-1) * t.unsqueeze(-2)).flatten(-2)
     return {"constant": constant, "slope": torch.stack(slope, -2)}
+
+
+def _hysteretic(function: KnownFunction, M: int, widest: int) -> dict[str, Tensor]:
+    """Where a hysteresis has its centre, the share of its second part, and its line."""
+    pad = torch.nn.functional.pad
+    share = function.parameters["share"]
+    s, t = function.shift.unbind(-1)
+    slope = torch.stack([share, torch.ones_like(share)], -1).unsqueeze(-2)
+    Z = pad(-function.shift, (0, widest - function.channels)).unsqueeze(-2)
+    return {
+        "Z": pad(Z, (0, 0, 0, M - 1)).unsqueeze(-3),
+        "weight": pad(share[..., None, None], (0, M - 1)),
+        "constant": -MEAN_SIZE * (t + share * s).unsqueeze(-1),
+        "slope": pad(-MEAN_SIZE * slope, (0, widest - function.channels)),
+    }
 
 
 def inducing_range(function: StaticFunction) -> tuple[Tensor, Tensor]:
