@@ -39,9 +39,10 @@ LINES = 31_500
 # and what happens shortly before a block ends (380 lines), and lengthscales that inducing values
 # resolve (70 lines), and parametric forms in feedback (160 lines), and compartments (280 lines, of
 # which tests are 200), and means of levels over steps, and products of inputs beside those of the
-# output (240 lines).
+# output (240 lines), and a hysteresis in feedback and bands of parameters that stay at their
+# optimum (800 lines, of which tests are 450).
 # To shrink.
-LINES_TODAY = 54_900
+LINES_TODAY = 55_200
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.scaling import Scaling
+from pyro_dynogp.inference.held_parameters import held_sites, moved_along
 from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.inference.posteriors import MethodName, Mixture, Posterior
 from pyro_dynogp.lti.modes import Modes
@@ -121,6 +122,17 @@ class Fitted:
     def system(self) -> System:
         """All parameters, batch (S,) of draws, in units of the scaled record."""
         return self.system_at(self.draws)
+
+    @property
+    def held(self) -> tuple[str, ...]:
+        """Sites of which predictions know no draws, see `held_sites`."""
+        return held_sites(self.model, self.posterior) if self.records else ()
+
+    @cached_property
+    def moved(self) -> Self | None:
+        """The fit with those moved, see `moved_along`; None where predictions are not finite."""
+        values = moved_along(self.model.collapsed, self.records, self.mode, self.held)
+        return None if values is None else self.with_draws(values)
 
     @isolated
     def system_at(self, values: Mapping[str, Tensor]) -> System:

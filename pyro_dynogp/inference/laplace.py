@@ -59,6 +59,16 @@ def fisher_normal(
     return None if here is None else (z, bounded_root(here.fisher + here.prior))
 
 
+def fisher_root(potential: Potential, values: Mapping[str, Tensor]) -> np.ndarray | None:
+    """Root (d, d) of the covariance that the Fisher matrix and the prior give at `values`.
+
+    None where predictions next to them are not finite, and as of `fisher_normal`.
+    """
+    innovations = _innovations(potential)
+    here = None if innovations is None else innovations.local(potential.pack(values).numpy())
+    return None if here is None else bounded_root(here.fisher + here.prior)
+
+
 def _innovations(potential: Potential) -> Innovations | None:
     """Of the unconstrained vector's density, where the model has such."""
     density = potential.log_density

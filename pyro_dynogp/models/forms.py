@@ -127,20 +127,19 @@ def Form(
     - "edge": x - at, zero below; width log(1 + exp((x - at) / width)). What flows over the edge of
       a tank, a stop that a mass hits, a valve that opens.
     - "cube": (x - at)^3, which contains a square. A spring that hardens or softens.
-    - "hysteresis", of two signals v and w: the two products (\|v\| - c) w and v (\|w\| - c), with
-      c = sqrt(2 / pi), so that they contain no line where both are standard normal. In feedback of
-      hidden signals that are a velocity and a force it makes the Bouc-Wen model,
-      w' = a v - b \|v\| w - d v \|w\|: a spring or a magnet whose force depends on its past.
+    - "hysteresis", of two signals v and w: (\|v\| - c) w + share v (\|w\| - c), c = sqrt(2 / pi),
+      which contains no line where both are standard normal. In feedback of hidden signals that are
+      a velocity and a force it makes the Bouc-Wen model, w' = a v - b \|v\| w - d v \|w\|, where
+      share is d / b: a spring or a magnet whose force depends on its past.
 
     A Gaussian process of one signal can take the same shapes, but needs many inducing values for an
     edge, has to learn from the data where a function bends, and keeps its value beyond them. The
-    gains of the layer that sees a form are its size and sign. A hysteresis has two outputs, the
-    others one.
+    gains of the layer that sees a form are its size and sign.
 
     Sites: ``<layer>_at``, normal with mean 0 (step, cube), -2 (root) or 1 (edge) and standard
-    deviation 1; ``<layer>_width``, LogNormal(-2, 1), of a step and of an edge; a hysteresis has
-    none. Inputs and the output are seen as standard deviations from their mean, signals of dynamics
-    as they are.
+    deviation 1; ``<layer>_width``, LogNormal(-2, 1), of a step and of an edge;
+    ``<layer>_share``, normal with mean 0.5 and standard deviation 1, of a hysteresis. Inputs and
+    the output are seen as standard deviations from their mean, signals of dynamics as they are.
 
     Args:
         form: "step", "root", "edge", "cube" or "hysteresis".
@@ -161,8 +160,8 @@ def Form(
         ['at', 'width']
         >>> mass = dgp.Dynamic(pairs=2, hidden=2, feedback=("past",), name="mass")
         >>> past = dgp.Form("hysteresis", sees=("mass_hidden",), name="past")
-        >>> dgp.Cascade(1, (mass, past), output="mass").wires[1].layer.outputs
-        2
+        >>> [wire.name for wire in dgp.Cascade(1, (mass, past), output="mass").wires]
+        ['mass', 'past']
     """
     if not isinstance(form, str) or form not in FORMS:
         expected = ", ".join(repr(known) for known in FORMS)

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.models.draws import JointState, variance_multiples
+from pyro_dynogp.models.draws import JointState, first_state, variance_multiples
 from pyro_dynogp.models.exact_outputs import ExactOutputs, spread_evenly
 from pyro_dynogp.models.late_systems import arrive
 from pyro_dynogp.models.output_process import OutputProcess, flat
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.prepared import PreparedRecord, with_outputs
+from pyro_dynogp.prediction.displaced import with_held_parameters
 from pyro_dynogp.prediction.first_state import beginning, unknown_beginning
 from pyro_dynogp.prediction.prediction import Parts, Prediction
 from pyro_dynogp.prediction.records import following, prepared
@@ -38,7 +40,7 @@ def simulate(
         system = unknown_beginning(fit)
         system = system if process_noise else system.without_process_noise
         outputs = output_process(system, along)
-        return _forward(fit, along, outputs, samples, seed, "simulation")
+        return _forward(fit, along, outputs, samples, seed, "simulation", _at_rest)
 
 
 def forecast(
@@ -59,7 +61,15 @@ def forecast(
         outputs = output_process(system, later, start=start)
         inputs = torch.cat([before.scaled_inputs, outputs.scaled_inputs], -2)
         outputs.noise_sd = before.system.noise_sd(inputs, time)[..., len(past) :, :]
-        return _forward(fit, later, outputs, samples, seed, "forecast")
+        return _forward(
+            fit, later, outputs, samples, seed, "forecast",
+            lambda other: _after(other, earlier, later, gap, process_noise=False)[1],
+        )  # fmt: skip
+
+
+def _at_rest(fit: Fitted) -> JointState:
+    """The state after past inputs of which nothing is known."""
+    return first_state(unknown_beginning(fit))
 
 
 def _after(
@@ -97,10 +107,17 @@ def runs_after(
 
 
 def _forward(
-    fit: Fitted, record: PreparedRecord, outputs: OutputProcess, samples: int, seed: int, kind: str
+    fit: Fitted,
+    record: PreparedRecord,
+    outputs: OutputProcess,
+    samples: int,
+    seed: int,
+    kind: str,
+    begin: Callable[[Fitted], JointState],
 ) -> Prediction:
     """Outputs from a first state and the inputs."""
     found = outputs.components(samples=samples, seed=seed, several_channels=not fit.collapsed)
+    found = with_held_parameters(fit, found, record, begin, seed)
     if fit.model.has_feedback:
         warn_of_divergence(fit, record.record, found.mean, kind)
     names = fit.scaling.output_names

@@ -192,10 +192,11 @@ class TestBlock:
             {"g": (("inputs",), more), **dict.fromkeys(more[:2], output),
              **dict.fromkeys(more[2:], hidden)},
             {w.name: (w.sources, w.feedback) for w in dgp.Compartments(1).wires},
+            {"g": (("inputs",), ("feedback_hysteresis",)), "feedback_hysteresis": hidden},
             {"g": (("inputs",), ("feedback", *unseen)), "feedback": output,
              **dict.fromkeys(unseen, hidden)},
         ]  # fmt: skip
-        for model in (*variants[:7], variants[8]):
+        for model in (*variants[:7], *variants[8:]):
             assert model.output_wire.name == "g"
             assert model.dynamic[0][1].pairs == 2
         said = [EFFECT.sentence(SAID, model) for model in variants]
@@ -212,6 +213,8 @@ class TestBlock:
             "not measured, act back on them.",
             "'x' is the level of the last of 2 compartments: what flows out of one, by a root and "
             "over an edge, enters the next.",
+            "It depends on the past: a hysteresis of two signals of the dynamics of 'x' that are "
+            "not measured acts back on them.",
             both,
         ]
 
@@ -228,7 +231,8 @@ class TestBlock:
         said = SimpleNamespace(where={"output": "x", "products": share})
         made = EFFECT.extend(dgp.LinearDynamicGP(1), said, spring)
         assert [one.dynamic[0][0].feedback[0] for one in made] == [
-            *leading, "hidden_feedback", "output_root", "output_root", "root1", "feedback"
+            *leading, "hidden_feedback", "output_root", "output_root", "root1",
+            "feedback_hysteresis", "feedback",
         ]  # fmt: skip
         assert made[-1].dynamic[0][0].feedback == (
             "feedback", "hidden_feedback", "feedback_step"
@@ -243,7 +247,7 @@ class TestBlock:
     def test_what_is_there_is_not_added_again(self, spring):
         """To a function of the output one of a hidden signal, and the other way round."""
         made = EFFECT.extend(dgp.LinearDynamicGP(1), SAID, spring)
-        first, second, product, hidden, _, forms, more, chain, both = made
+        first, second, product, hidden, _, forms, more, chain, past, both = made
         back = {"feedback", "hidden_feedback", "feedback_step"}
         products = [{"feedback_product"}, {"hidden_product"}]
         of_output = {"output_root", "output_edge", "output_step"}
@@ -260,7 +264,10 @@ class TestBlock:
         assert of_output | of_hidden in made
         for model in (more, both):
             assert len(EFFECT.extend(model, SAID, spring)) == 2  # products
-        assert len(EFFECT.extend(product, SAID, spring)) == 7
+        assert len(EFFECT.extend(product, SAID, spring)) == 8
+        added = [one.dynamic[0][0].feedback for one in EFFECT.extend(past, SAID, spring)]
+        assert ("feedback_hysteresis", "feedback") in added
+        assert all(one.count("feedback_hysteresis") == 1 and len(one) > 1 for one in added)
         for model in EFFECT.extend(chain, SAID, spring):  # of inputs and the level
             assert model.dynamic[-1][0].feedback[-1] == "feedback_product"
             assert EFFECT.sentence(SAID, model).endswith(
