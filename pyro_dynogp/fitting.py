@@ -82,6 +82,9 @@ class Fit(Exports):
     ) -> Prediction:
         """Outputs from the inputs alone, from an unknown initial state.
 
+        With feedback, what is uncertain of parameters that the posterior holds at their optimum is
+        in the bands to first order, see `inference.held_parameters`.
+
         Args:
             record: time and inputs; its outputs are not used.
             process_noise: False for the response of the deterministic system.
@@ -112,6 +115,8 @@ class Fit(Exports):
         seed: int = 0,
     ) -> Prediction:
         """Outputs of `future` given inputs and outputs of `past`, the state carried over exactly.
+
+        Parameters that the posterior holds at their optimum count as for `simulate`.
 
         Args:
             past: up to now. future: later times, with inputs; its outputs are not used.

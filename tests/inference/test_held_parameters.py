@@ -154,3 +154,22 @@ def test_where_predictions_next_to_the_optimum_are_not_finite_this_is_said(
     monkeypatch.setattr(type(fit), "held", ())
     expected = fit.forecast(PLANT.train, PLANT.test, seed=0)
     np.testing.assert_array_equal(found.component_mean, expected.component_mean)
+
+
+def test_several_outputs_at_irregular_times_with_missing_ones():
+    record = make_record(outputs=2, n=200, irregular=True)
+    model = dgp.NonlinearFeedback(1, outputs=2, inducing=6, process_noise=False)
+    fit = dgp.fit(model, record[:160], method="svi", **QUICK)
+    assert fit.held
+    for found in (fit.forecast(record[:160], record[160:], seed=0), fit.simulate(record, seed=0)):
+        assert np.isfinite(found.variance).all()
+        assert found.samples.shape[1:] == found.mean.shape
+        assert (found.parts["parameters"] > 0.0).all()
+
+
+def test_displacements_come_again_with_their_seed(forms):
+    runs = runs_of(forms, forms.moved.draws)
+    one, again, other = (held_parameters.displacements(runs, 50, seed) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(one, again)
+    assert not np.allclose(one, other)
+    assert forms.moved is forms.moved  # computed once
