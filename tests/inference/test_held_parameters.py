@@ -51,6 +51,7 @@ def test_which_sites_are_held(spring, forms):
         constant = {k for k, x in fit.draws.items() if torch.equal(x, x[:1].expand_as(x))}
         assert constant - never == set(fit.held)
         assert fit.at_mode().held == ()
+        assert fit.moved.held == ()  # other draws have what is uncertain of them
         assert dataclasses.replace(fit, records=()).held == ()
 
 
