@@ -5,7 +5,8 @@ all of them together run away, as free runs go far where the density ends. Of sm
 runs away. With z the unconstrained vector, H = F + F_prior its precision at the mode (F the Fisher
 matrix of one-step predictions) and h the entries that are held, what is left unknown of these is
 normal with covariance S = (H^-1)_hh, and the others follow them by (H^-1)_fh S^-1. A free run moves
-by its derivative along the columns of (H^-1)_(.h) S^(-T/2), each times a standard normal number.
+by its derivative along the columns of (H^-1)_(.h) S^(-T/2), each times a standard normal number:
+equation (16) of docs/explanation/mathematics.md.
 
 Source: linearised Laplace predictions: D. MacKay, Neural Computation 4(3):448, 1992, and Immer,
 Korzepa and Bauer, AISTATS 2021, for neural networks. Kernels and process noise are not among them:
