@@ -5,8 +5,9 @@ all of them together run away, as free runs go far where the density ends. Of sm
 runs away. With z the unconstrained vector, H = F + F_prior its precision at the mode (F the Fisher
 matrix of one-step predictions) and h the entries that are held, what is left unknown of these is
 normal with covariance S = (H^-1)_hh, and the others follow them by (H^-1)_fh S^-1. A free run moves
-by its derivative along the columns of (H^-1)_(.h) S^(-T/2), each times a standard normal number:
-equation (16) of docs/explanation/mathematics.md.
+by its derivative along the columns of (H^-1)_(.h) S^(-1/2), each times a standard normal number:
+equation (16) of docs/explanation/mathematics.md. The root is the symmetric one, so that columns do
+not depend on the order of parameters but for their own.
 
 Source: linearised Laplace predictions: D. MacKay, Neural Computation 4(3):448, 1992, and Immer,
 Korzepa and Bauer, AISTATS 2021, for neural networks. Kernels and process noise are not among them:
@@ -30,7 +31,7 @@ from pyro_dynogp.inference.posteriors import Mixture, Posterior
 from pyro_dynogp.models.model import Model
 
 # Share of a standard deviation by which parameters are moved for a derivative.
-MOVE = 0.05
+MOVE = 0.01
 
 
 def held_sites(model: Model, posterior: Posterior) -> tuple[str, ...]:
@@ -66,21 +67,19 @@ def moved_along(
         return None
     places = potential.places(held)
     covariance = whole @ whole.T
-    root = np.linalg.cholesky(covariance[np.ix_(places, places)])
-    directions = MOVE * np.linalg.solve(root, covariance[places])
+    values, axes = np.linalg.eigh(covariance[np.ix_(places, places)])
+    directions = MOVE * (axes / np.sqrt(values)) @ axes.T @ covariance[places]
     z = potential.pack(free).numpy()
     points = np.concatenate([z[None], z + directions, z - directions])
     moved = {name: x.detach() for name, x in potential.unpack(torch.from_numpy(points)).items()}
     return moved | {name: x.expand(len(points), *x.shape) for name, x in kept.items()}
 
 
-def displacements(runs: np.ndarray, count: int, seed: int) -> np.ndarray:
-    """Random displacements (count, n, n_y) of free runs, of mean zero.
+def slopes_of(runs: np.ndarray) -> np.ndarray:
+    """Derivatives (p, n, n_y) of free runs along the p directions, of variance one each.
 
     Args:
-        runs: (1 + 2 p, n, n_y), of the values of `moved_along`. count: of them. seed: of theirs.
+        runs: (1 + 2 p, n, n_y), of the values of `moved_along`.
     """
     p = len(runs) // 2
-    slopes = (runs[1 : p + 1] - runs[p + 1 :]) / (2.0 * MOVE)
-    standard = np.random.default_rng(seed).standard_normal((count, p))
-    return np.einsum("sp,pnk->snk", standard - standard.mean(0), slopes)
+    return np.asarray((runs[1 : p + 1] - runs[p + 1 :]) / (2.0 * MOVE))

@@ -1,4 +1,4 @@
-"""Free runs displaced by what is not known of parameters that stay at their optimum."""
+"""What parameters that stay at their optimum add to the variance of free runs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from pyro_dynogp.inference.held_parameters import displacements
+from pyro_dynogp.inference.held_parameters import slopes_of
 from pyro_dynogp.models.draws import JointState
 from pyro_dynogp.models.output_process import Components
 from pyro_dynogp.models.outputs import output_process
@@ -34,35 +34,35 @@ def with_held_parameters(
     begin: Callable[[Fitted], JointState],
     seed: int,
 ) -> Components:
-    """Components each displaced by a draw of the parameters that are held, to first order.
+    """Components with the variance that parameters add to first order which are held.
 
-    As they are where no parameters are held, see `inference.held_parameters`. Means of all
-    components do not change.
+    As they are where no parameters are held, see `inference.held_parameters`. Means do not change;
+    joint samples are displaced along the derivatives.
 
     Args:
-        fit: the fit. found: of its draws. record: along which. seed: of the draws.
+        fit: the fit. found: of its draws. record: along which. seed: of the samples.
         begin: gives the state at the first sample for other values of the parameters.
     """
     if not fit.held:
         return found
-    moved = fit.moved
-    shift = None
-    if moved is not None:
-        runs = mean_runs(moved, record, begin(moved))
-        shift = displacements(runs, len(found.mean), seed)
-    if shift is None or not np.isfinite(shift).all():
+    slopes = None
+    if fit.moved is not None:
+        slopes = slopes_of(mean_runs(fit.moved, record, begin(fit.moved)))
+    if slopes is None or not np.isfinite(slopes).all():
         warn(NOT_FINITE)
         return found
+    extra = np.square(slopes).sum(0)
 
     def parts() -> Mapping[str, np.ndarray]:
         shares = dict(found.parts())
-        return shares | {"parameters": shares.get("parameters", 0.0) + shift.var(0)}
+        return shares | {"parameters": shares.get("parameters", 0.0) + extra}
 
     def draw() -> np.ndarray:
         y = found.draw()
-        return y + shift[: len(y)]
+        standard = np.random.default_rng(seed).standard_normal((len(y), len(slopes)))
+        return y + np.einsum("sp,pnk->snk", standard, slopes)
 
-    return replace(found, mean=found.mean + shift, parts=parts, draw=draw)
+    return replace(found, variance=found.variance + extra, parts=parts, draw=draw)
 
 
 def mean_runs(fit: Fitted, record: PreparedRecord, start: JointState) -> np.ndarray:

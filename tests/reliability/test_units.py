@@ -66,6 +66,9 @@ class Kind:
 
     Process noise that vanishes has a logarithm without a mode: where a climb stops for lack of
     slope, what is left of it is as small as that, not as rounding. Such kinds have a `tolerance`.
+
+    Bands of parameters that are held have the inverse of a Fisher matrix by one-sided differences,
+    whose rounding grows where the record says little: sds are the same within `spread`.
     """
 
     record: Any
@@ -74,6 +77,7 @@ class Kind:
     outputs: bool = False
     inputs: bool = True
     tolerance: float = SAME
+    spread: float = SAME
     one_step: bool = False
     units: bool = True
 
@@ -134,6 +138,7 @@ KINDS = {
         lambda: dgp.NonlinearFeedback(2, outputs=2, pairs=1, inducing=5),
         {"restarts": 1, "steps": 20, "draws": 20},
         outputs=True,
+        spread=1e-3,
     ),
     "Student's t": Kind(
         first_output,
@@ -187,11 +192,11 @@ def first():
     return of
 
 
-def same(one, other, tolerance=SAME):
+def same(one, other, tolerance=SAME, spread=SAME):
     for name in ("mean", "sd", "noise"):
         a, b = getattr(one, name), getattr(other, name)
         off = np.abs(a - b).max() / np.abs(a).max()
-        assert off < tolerance, (name, off)
+        assert off < (max(tolerance, spread) if name == "sd" else tolerance), (name, off)
     assert abs(one.log_p - other.log_p) < max(tolerance, SAME)
 
 
@@ -227,7 +232,7 @@ def test_units(kind, channel, factor, first):
         "input_names": record.input_names, "output_names": record.output_names,
     }  # fmt: skip
     other = told(KINDS[kind], dgp.Record(record.time, inputs, outputs, **names), units)
-    same(first(kind), other, KINDS[kind].tolerance)
+    same(first(kind), other, KINDS[kind].tolerance, KINDS[kind].spread)
     if KINDS[kind].tolerance == SAME:
         same_sites(first(kind), other)
 
@@ -235,14 +240,14 @@ def test_units(kind, channel, factor, first):
 @pytest.mark.parametrize("kind", [name for name, one in KINDS.items() if one.inputs])
 def test_order_of_inputs(kind, first):
     record = KINDS[kind].record().select(inputs=["v", "u"])
-    same(first(kind), told(KINDS[kind], record), KINDS[kind].tolerance)
+    same(first(kind), told(KINDS[kind], record), KINDS[kind].tolerance, KINDS[kind].spread)
 
 
 @pytest.mark.parametrize("kind", [name for name, one in KINDS.items() if one.outputs])
 def test_order_of_outputs(kind, first):
     record = KINDS[kind].record().select(outputs=["z", "y"])
     other = told(KINDS[kind], record, outputs=[1, 0])
-    same(first(kind), other)
+    same(first(kind), other, spread=KINDS[kind].spread)
     for a, b in zip(first(kind).fit.system.layers, other.fit.system.layers, strict=True):
         if isinstance(a, DynamicSystem):
             np.testing.assert_allclose(b.modes.poles.numpy(), a.modes.poles.numpy(), rtol=SAME)
