@@ -40,7 +40,7 @@ LINES = 31_500
 # resolve (70 lines), and parametric forms in feedback (160 lines), and compartments (280 lines, of
 # which tests are 200), and means of levels over steps, and products of inputs beside those of the
 # output (240 lines), and a hysteresis in feedback and bands of parameters that stay at their
-# optimum (880 lines, of which tests are 500).
+# optimum (390 lines).
 # To shrink.
 LINES_TODAY = 55_200
 
