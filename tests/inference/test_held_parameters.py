@@ -172,3 +172,11 @@ def test_directions_do_not_depend_on_the_order_of_sites(forms):
     assert forms.moved is forms.moved  # computed once
     for name, x in forms.moved.draws.items():
         torch.testing.assert_close(values[name], x, rtol=1e-9, atol=1e-12)
+
+
+def test_a_file_gives_the_same_bands(forms, tmp_path):
+    forms.save(tmp_path / "fit.safetensors")
+    again = dgp.load(tmp_path / "fit.safetensors")
+    assert again.held == forms.held
+    one, other = (f.forecast(PLANT.train, PLANT.test, seed=0) for f in (forms, again))
+    np.testing.assert_array_equal(other.variance, one.variance)
