@@ -55,8 +55,8 @@ def fisher_normal(
     if innovations is None:
         return None
     z = climb(innovations, potential.pack(values).numpy(), steps)[0]
-    here = innovations.local(z)
-    return None if here is None else (z, bounded_root(here.fisher + here.prior))
+    root = _root_at(innovations, z)
+    return None if root is None else (z, root)
 
 
 def fisher_root(potential: Potential, values: Mapping[str, Tensor]) -> np.ndarray | None:
@@ -65,7 +65,11 @@ def fisher_root(potential: Potential, values: Mapping[str, Tensor]) -> np.ndarra
     None where predictions next to them are not finite, and as of `fisher_normal`.
     """
     innovations = _innovations(potential)
-    here = None if innovations is None else innovations.local(potential.pack(values).numpy())
+    return None if innovations is None else _root_at(innovations, potential.pack(values).numpy())
+
+
+def _root_at(innovations: Innovations, z: np.ndarray) -> np.ndarray | None:
+    here = innovations.local(z)
     return None if here is None else bounded_root(here.fisher + here.prior)
 
 

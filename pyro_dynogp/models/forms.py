@@ -167,12 +167,9 @@ def Form(
         expected = ", ".join(repr(known) for known in FORMS)
         raise invalid("form", expected=f"one of {expected}", got=repr(form))
     function, priors = FORMS[form]
-    if form == "hysteresis":
-        return Known(
-            function, priors, range=(-math.inf, math.inf), scaled=True, skip=skip,
-            sees=sees, name=name,
-        )  # fmt: skip
-    return Known(function, priors, scaled=True, skip=skip, sees=sees, name=name)
+    # Compiled as it is: it has no table, which would end.
+    ends = (-math.inf, math.inf) if form == "hysteresis" else None
+    return Known(function, priors, range=ends, scaled=True, skip=skip, sees=sees, name=name)
 
 
 def forms_of(name: str, *, hidden: bool) -> list[Known]:

@@ -15,8 +15,8 @@ from pyro_dynogp.models.late_systems import arrive
 from pyro_dynogp.models.output_process import OutputProcess, flat
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.prepared import PreparedRecord, with_outputs
-from pyro_dynogp.prediction.displaced import with_held_parameters
 from pyro_dynogp.prediction.first_state import beginning, unknown_beginning
+from pyro_dynogp.prediction.free_run_variance import with_held_parameters
 from pyro_dynogp.prediction.prediction import Parts, Prediction
 from pyro_dynogp.prediction.records import following, prepared
 from pyro_dynogp.support.errors import warn

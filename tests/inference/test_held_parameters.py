@@ -14,7 +14,7 @@ from pyro_dynogp.inference.free_runs import noise_sites
 from pyro_dynogp.inference.function_evidence import kernel_sites
 from pyro_dynogp.inference.laplace import fisher_root
 from pyro_dynogp.models.draws import first_state
-from pyro_dynogp.prediction import displaced, predict
+from pyro_dynogp.prediction import free_run_variance, predict
 from pyro_dynogp.prediction.first_state import unknown_beginning
 from pyro_dynogp.prediction.records import prepared
 from tests.models.closed_loops import make_record
@@ -37,7 +37,7 @@ def runs_of(fit, values):
     """Runs along the test record from rest, without noise, at values of the sites."""
     other = fit.with_draws(values)
     along = prepared(fit, PLANT.test)
-    return displaced.mean_runs(other, along, first_state(unknown_beginning(other)))
+    return free_run_variance.mean_runs(other, along, first_state(unknown_beginning(other)))
 
 
 def test_which_sites_are_held(spring, forms):
@@ -72,7 +72,7 @@ def test_others_hold_none(model, method):
 
 
 @pytest.mark.parametrize("which", ["spring", "forms"])
-def test_displacements_have_the_covariance_of_the_block_formula(which, request):
+def test_the_variance_is_that_of_the_block_formula(which, request):
     """J S J', with J = J_h - J_f H_ff^-1 H_fh and S = (H_hh - H_hf H_ff^-1 H_fh)^-1."""
     fit = request.getfixturevalue(which)
     model = fit.model.collapsed
@@ -131,7 +131,7 @@ def test_runs_at_the_mode_are_those_of_the_mode(forms):
     other = forms.with_draws(same)
     earlier, later, gap = predict.following(other, PLANT.train, PLANT.test)
     _, start = predict._after(other, earlier, later, gap, process_noise=False)
-    found = displaced.mean_runs(other, later, start)
+    found = free_run_variance.mean_runs(other, later, start)
     assert found.shape == (3, len(PLANT.test), 1)
     spread = float(PLANT.test.outputs.std())
     for run in found:
@@ -146,7 +146,7 @@ def test_where_predictions_next_to_the_optimum_are_not_finite_this_is_said(
     if where == "matrix":
         monkeypatch.setattr(held_parameters, "fisher_root", lambda *_: None)
     else:
-        monkeypatch.setattr(displaced, "slopes_of", lambda runs: np.inf * runs)
+        monkeypatch.setattr(free_run_variance, "slopes_of", lambda runs: np.inf * runs)
     with pytest.warns(UserWarning, match="Next to the optimum predictions are not finite"):
         found = fit.forecast(PLANT.train, PLANT.test, seed=0)
     monkeypatch.setattr(type(fit), "held", ())

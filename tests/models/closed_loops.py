@@ -11,6 +11,7 @@ import torch
 
 import pyro_dynogp as dgp
 from pyro_dynogp.layers.sites import sample
+from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.wiring import Dynamic, Static
 
 
@@ -61,6 +62,32 @@ def values_of(model, record, seed=0, linear=True):
 
 def system_at(model, values):
     return model.begin(model.system(values, model.scaling), model.states_of(values, ""))
+
+
+def check_free_run(model, values, record, back, rtol):
+    """Free runs without process noise against a plain simulation, in scaled outputs.
+
+    back: what comes back, of a list of the output, with its offset, and of the hidden signals.
+    """
+    system = system_at(model, values)
+    modes, scaling = system.layer("g").modes, model.scaling
+    lam, B = (np.concatenate([x, x.conj()]) for x in (modes.poles.numpy(), modes.B.numpy()))
+    C = np.concatenate([modes.C.numpy(), modes.C.numpy().conj()], -1)
+    first = system.layer("g").first_state.numpy()
+    x = np.concatenate([first, first.conj()])
+    u = (record.inputs[:, 0] - scaling.input_offset) / scaling.input_scale
+    expected = []
+    for k, step in enumerate(np.diff(record.time, append=record.time[-1] + 0.1)):
+        signals = np.atleast_1d((C @ x).real)
+        signals[0] += float(values["offset"])
+        expected.append(signals[0])
+        gain = (np.expm1(lam * step) / lam)[:, None] * B
+        x = np.exp(lam * step) * x + gain[:, 0] * float(u[k]) + gain[:, 1] * back(list(signals))
+    (prepared,) = model.prepare(record)
+    # Without process noise outputs say nothing of the state.
+    found = output_process(system, prepared).one_step(prepared.observations).mean.numpy()
+    found = ((found - scaling.output_offset) / scaling.output_scale).ravel()
+    np.testing.assert_allclose(found, expected, rtol=rtol, atol=rtol)
 
 
 def plain_loop(model, system, record, slope=0.0, constant=0.0):

@@ -18,7 +18,7 @@ from pyro_dynogp.models.forms import form_of, have_no_place
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.moments.functions import HYSTERESIS, Expansion, expansion, expansion_adjoint
 from tests.benchmarks.feedback_plants import simulate_bouc_wen
-from tests.models.closed_loops import check_gradient, make_record, system_at
+from tests.models.closed_loops import check_free_run, check_gradient, make_record, system_at
 from tests.models.test_known import values_at
 
 C = np.sqrt(2.0 / np.pi)
@@ -46,29 +46,14 @@ def test_free_runs_are_those_of_a_plain_simulation(sees, hidden):
     values = values_at(model, 3)
     small = {k: 0.2 * x for k, x in values.items() if k.endswith("_gain")}  # products grow
     values |= small
-    system = system_at(model, values)
-    modes, scaling, share = system.layer("g").modes, model.scaling, float(values["past_share"])
-    offset = float(values["offset"])
-    lam, B = (np.concatenate([x, x.conj()]) for x in (modes.poles.numpy(), modes.B.numpy()))
-    gains = np.concatenate([modes.C.numpy(), modes.C.numpy().conj()], -1)
-    first = system.layer("g").first_state.numpy()
-    x = np.concatenate([first, first.conj()])
-    u = (record.inputs[:, 0] - scaling.input_offset) / scaling.input_scale
-    expected = []
-    for k, step in enumerate(np.diff(record.time, append=record.time[-1] + 0.1)):
-        signals = (gains @ x).real
-        y = float(signals[0] + offset)
-        expected.append(y)
-        seen = {"g": [y], "g_hidden": list(signals[1:])}
+    share = float(values["past_share"])
+
+    def back(signals):
+        seen = {"g": signals[:1], "g_hidden": signals[1:]}
         v, w = (one for name in sees for one in seen[name])
-        back = (abs(v) - C) * w + share * v * (abs(w) - C)
-        held = (np.expm1(lam * step) / lam)[:, None] * B
-        x = np.exp(lam * step) * x + held[:, 0] * float(u[k]) + held[:, 1] * back
-    (prepared,) = model.prepare(record)
-    # Without process noise outputs say nothing of the state.
-    found = output_process(system, prepared).one_step(prepared.observations).mean.numpy()
-    found = ((found - scaling.output_offset) / scaling.output_scale).ravel()
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+        return (abs(v) - C) * w + share * v * (abs(w) - C)
+
+    check_free_run(model, values, record, back, 1e-9)
 
 
 @SEES
