@@ -11,6 +11,7 @@ from pyro_dynogp.criticism.physical import physical_quantities
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.models.arrival import DELAY
+from pyro_dynogp.models.selection import part, place_of, signal_of
 from pyro_dynogp.models.wiring import INPUTS, Dynamic, Known, Static, Wire
 
 COLUMNS = ("mean", "sd", "2.5 %", "97.5 %", "unit")
@@ -93,16 +94,18 @@ def _lengthscales(fit: Fitted, wire: Wire) -> Iterator[Row]:
         return
     seen: list[tuple[str, float, str]] = []
     for source in wire.sources:
-        own = next((w for w in fit.model.wires if w.name == source), None)
-        if source == INPUTS and fit.model.inputs == len(scaling.input_names):
+        whole = signal_of(source)
+        own = next((w for w in fit.model.wires if w.name == whole), None)
+        if whole == INPUTS and fit.model.inputs == len(scaling.input_names):
             units = scaling.input_units
-            seen += list(zip(scaling.input_names, scaling.input_scale, units, strict=True))
+            known = list(zip(scaling.input_names, scaling.input_scale, units, strict=True))
         elif own is not None and own.name == fit.model.output_wire.name:
             units = scaling.output_units
-            seen += list(zip(scaling.output_names, scaling.output_scale, units, strict=True))
+            known = list(zip(scaling.output_names, scaling.output_scale, units, strict=True))
         else:
             width = wire.channels - len(seen) if own is None else own.layer.outputs
-            seen += [(source, 1.0, "")] * width
+            known = [(source, 1.0, "")] * width
+        seen += known[part(source, len(known))] if place_of(source) is not None else known
     if len(seen) != wire.channels:
         seen = [("what it sees", 1.0, "")] * wire.channels
     values = draws.reshape(len(draws), -1).numpy()

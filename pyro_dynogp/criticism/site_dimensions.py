@@ -12,6 +12,7 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.models.arrival import LATE
 from pyro_dynogp.models.model import Model
+from pyro_dynogp.models.selection import part, signal_of
 from pyro_dynogp.models.wiring import INPUTS
 
 # The two numbers of a gain (see `sample_modes`), and of a complex number.
@@ -61,7 +62,11 @@ def labels_of(model: Model, scaling: Scaling, records: Sequence[Record]) -> dict
             dim, own = wire.dims["output"], [signals[name] for name in wire.signals]
             labels[dim] = (dim, np.array([label for names in own for label in names]), {})
     for wire in model.wires:
-        seen = tuple(label for source in wire.sources for label in signals[source])
+        seen = tuple(
+            label
+            for source in wire.sources
+            for label in signals[signal_of(source)][part(source, len(signals[signal_of(source)]))]
+        )
         fed = tuple(label for source in wire.feedback for label in signals[source])
         for role, names in (("direct", seen), ("input", seen + fed)):
             dim = wire.dims[role]

@@ -15,6 +15,7 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.effects.base import Parameters, centre_of
 from pyro_dynogp.models.feedback_variants import with_products
 from pyro_dynogp.models.product import factors
+from pyro_dynogp.models.selection import signal_of
 from pyro_dynogp.models.system import DynamicSystem
 from pyro_dynogp.models.variants import Model, with_channels
 from pyro_dynogp.models.wiring import HIDDEN, Wire
@@ -84,7 +85,7 @@ def dominant_rates(fit: Fit, fed: Wire, record: Record) -> Parameters:
     product = next(wire for wire in fit.model.wires if wire.name == back)
     assert isinstance(dynamic, DynamicSystem)
     inputs = factors(product.layer)
-    hidden = product.sources[-1].endswith(HIDDEN)
+    hidden = signal_of(product.sources[-1]).endswith(HIDDEN)
     count = len(scaling.output_names)
     C = dynamic.modes.C if dynamic.modes.several_outputs else dynamic.modes.C.unsqueeze(-2)
     C = C[..., count:, :] if hidden else C[..., :count, :]

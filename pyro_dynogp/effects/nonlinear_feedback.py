@@ -9,24 +9,24 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import torch
 
-from pyro_dynogp.data.channels import Product
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.data.signals import hermite, hinges
 from pyro_dynogp.effects.base import Effect, Parameters
 from pyro_dynogp.effects.bilinear import dominant_rates, products, with_products_of_inputs
+from pyro_dynogp.effects.feedback_sentence import what_acts_back
 from pyro_dynogp.lti.views import steady_state_gain
 from pyro_dynogp.models.compartments import in_place_of
 from pyro_dynogp.models.feedback_variants import (
     with_feedback,
     with_forms,
     with_hysteresis,
+    with_joint_feedback,
     with_products,
 )
-from pyro_dynogp.models.forms import form_of, hysteresis
+from pyro_dynogp.models.forms import hysteresis
 from pyro_dynogp.models.product import is_product
 from pyro_dynogp.models.system import DynamicSystem
 from pyro_dynogp.models.variants import Model
-from pyro_dynogp.models.wiring import HIDDEN
 from pyro_dynogp.statistics.bootstrap import Scan
 from pyro_dynogp.statistics.detecting import lasting
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
@@ -170,7 +170,8 @@ class NonlinearFeedbackOfOutput(Effect):
     """What acts back on the dynamics: spring, friction, outflow, a flow that carries heat.
 
     A function of the output, of a signal of the same states that nothing measures (a velocity, the
-    level of another tank), or one of each; roots, edges and a step of both; products of the inputs
+    level of another tank), or one of each, of several outputs one function for each and one of all
+    together; roots, edges and steps of both; products of the inputs
     with the output, and with each other, or with such a signal; two compartments in place of linear
     dynamics; a hysteresis of two such signals. A later one only where it is certainly better.
     """
@@ -194,6 +195,8 @@ class NonlinearFeedbackOfOutput(Effect):
         Products come first where the test has one as its best column, and are left out where none
         gains nearly as much: refits take as long as those of functions. A step beside a smooth
         function may hold it at a poor optimum, of 70 nats less in one spring between two masses.
+        Beside functions of several outputs that act back already there are no steps and forms: they
+        were tried together with these, and take minutes.
         """
         share = float(evidence.where["products"])
         alone, stepped = (
@@ -211,43 +214,14 @@ class NonlinearFeedbackOfOutput(Effect):
         forms = [with_forms(model), with_forms(model, hidden=True)]
         chain = in_place_of(model, CHAIN)
         past, both = with_hysteresis(model), with_feedback(model, hidden=True)
-        extended = [*leading, stepped, *forms, chain, past, both]
+        extended = [*leading, stepped, with_joint_feedback(model), *forms, chain, past, both]
+        if model.has_feedback and model.outputs > 1:
+            extended = leading
         return list({repr(variant): variant for variant in extended if variant}.values())
 
     def sentence(self, evidence: Evidence, model: Model) -> str:
         """Of which signals it is a function."""
-        wires = {wire.name: wire for wire in model.wires}
-        back = [wires[name] for wire in model.wires for name in wire.feedback]
-        past = [one for one in back if form_of(one.layer) == "hysteresis"]
-        smooth = [one for one in back if not is_product(one.layer) and one not in past]
-        functions = {s for one in smooth for s in one.sources}
-        factors = {one.sources[-1] for one in back if is_product(one.layer)}
-        y = evidence.where["output"]
-        if model.has_real_poles and not factors:
-            return (
-                f"'{y}' is the level of the last of {len(model.dynamic)} compartments: what flows "
-                "out of one, by a root and over an edge, enters the next."
-            )
-        unseen = f"a signal of the dynamics of '{y}' that is not measured"
-        hidden = {name for name in functions if name.endswith(HIDDEN)}
-        said = []
-        if hidden and hidden == functions:
-            said.append(f"A nonlinear function of {unseen} acts back on them.")
-        elif hidden:
-            said.append(f"Nonlinear functions of '{y}', and of {unseen}, act back on them.")
-        elif functions or not (factors or past):
-            said.append(evidence.sentence)
-        if past:
-            said.append(
-                "It depends on the past: a hysteresis of two signals of the dynamics of "
-                f"'{y}' that are not measured acts back on them."
-            )
-        for factor in sorted(factors):
-            other = unseen if factor.endswith(HIDDEN) else f"'{y}'"
-            said.append(f"Inputs times {other} act back on its dynamics.")
-        if factors and any(isinstance(channel, Product) for channel in model.channels):
-            said.append("Products of inputs drive them as well.")
-        return " ".join(said)
+        return what_acts_back(model, str(evidence.where["output"]), evidence.sentence)
 
     def parameters(self, fit: Fit, evidence: Evidence, record: Record) -> Parameters:
         """What it does to the dynamics, in numbers.

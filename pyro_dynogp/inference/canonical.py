@@ -28,6 +28,7 @@ from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.posteriors import Posterior, Sampled
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord, as_measured
+from pyro_dynogp.models.selection import place_of
 from pyro_dynogp.models.wiring import INPUTS, Known, Wire
 from pyro_dynogp.support.frozen import FrozenMapping
 
@@ -184,6 +185,8 @@ def _free(model: Model) -> bool:
 
 def _free_layer(wire: Wire) -> bool:
     layer = wire.layer
+    if any(place_of(source) is not None for source in wire.sources):
+        return False
     if isinstance(layer, Known):
         return layer.scaled and wire.channels == 1
     kernel, limits = getattr(layer, "kernel", None), getattr(layer, "limits", None)

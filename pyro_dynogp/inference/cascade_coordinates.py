@@ -122,7 +122,7 @@ def steps_of(model: Model, plain: Potential) -> list[Step]:
     sizes: dict[str, RelativeToGain] = {}
     for one in model.wires:
         if isinstance(one.layer, Dynamic) and f"{one.name}_input_gain" in named:
-            readers = [other for other in model.wires if one.name in other.sources]
+            readers = [other for other in model.wires if one.name in other.reads]
             if one.layer.width == 1 and len(readers) == 1:
                 found = _relative(one, readers[0], named, plain.at)
                 if found is not None:

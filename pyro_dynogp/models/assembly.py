@@ -26,6 +26,7 @@ from pyro_dynogp.lti.response import mean_response
 from pyro_dynogp.models.filter_functions import Block, functions_of, inducing_range
 from pyro_dynogp.models.known import KnownFunction
 from pyro_dynogp.models.lag_means import LagMean, has_mean, mean_of_lag
+from pyro_dynogp.models.selection import signal_of
 from pyro_dynogp.models.signal import KNOWN, TRAJECTORY, Signal, places_of_outputs
 from pyro_dynogp.models.system import DynamicSystem, StaticSystem, System
 from pyro_dynogp.models.wiring import INPUTS, Wire
@@ -91,7 +92,7 @@ class _Assembler:
         return x.expand(self.batch + x.shape[x.dim() - event :])
 
     def sources(self, place: Wire) -> Signal:
-        parts = [self.signals[name] for name in place.sources]
+        parts = [self.signals[signal_of(name)].seen(name) for name in place.sources]
         known = torch.cat([self.expand(p.known, 2) for p in parts], -1)
         outputs = tuple(o for p in parts for o in p.outputs)
         if all(p.rows is None for p in parts):
@@ -182,7 +183,7 @@ class _Assembler:
         found, first = {}, 0
         wires = {wire.name: wire for wire in self.system.wires}
         for name in place.sources if self.system.has_feedback and len(self.grid.steps) else ():
-            known = self.signals[name].known
+            known = self.signals[signal_of(name)].seen(name).known
             if name in self.fed and has_mean(wires[name], place):
                 modes, shares = self.fed[name]
                 found[first] = mean_of_lag(modes, self.grid, known[..., 0], shares)

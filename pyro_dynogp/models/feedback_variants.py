@@ -9,13 +9,15 @@ from pyro_dynogp.models.forms import Form, form_of, forms_of, usual_substeps
 from pyro_dynogp.models.layer import fed_back
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.product import Product, is_product
+from pyro_dynogp.models.selection import each_channel, signal_of
 from pyro_dynogp.models.variants import with_dynamics
 from pyro_dynogp.models.wiring import HIDDEN, INPUTS, Dynamic, Known, Layer, Static, Wire
 
-# Names of functions that act back: of a layer's output, and of a signal of it that is hidden, and
-# of a step of the latter, a hysteresis of two such signals, and products of inputs with the output
-# or with the hidden signal.
+# Names of functions that act back: of a layer's outputs, of signals of it that are hidden, and of
+# steps of the latter, of all outputs together, a hysteresis of two hidden signals, and products of
+# inputs with the output or with a hidden signal.
 FEEDBACK, HIDDEN_FEEDBACK, STEP = "feedback", "hidden_feedback", "feedback_step"
+JOINT_FEEDBACK = "joint_feedback"
 HYSTERESIS = "feedback_hysteresis"
 PRODUCT, HIDDEN_PRODUCT = "feedback_product", "hidden_product"
 
@@ -25,42 +27,59 @@ def with_feedback(
 ) -> Model | None:
     """The model with static layers that see its last dynamic layer and act back on it.
 
-    Static layers may follow that layer: they are what measures it. None where there is nothing to
-    add, with feedback to another layer, and under noise that feedback does not allow.
+    Static layers may follow that layer: they are what measures it. Each function sees one signal.
+    None where there is nothing to add, with feedback to another layer, and under noise that
+    feedback does not allow.
 
     Args:
-        model: to extend. output: whether one function sees the output of the layer.
-        hidden: whether one sees a further signal of the same states, which nothing measures.
-        step: whether a step of that comes back as well.
+        model: to extend. output: whether functions see the outputs of the layer.
+        hidden: whether others see as many further signals of the same states, which nothing
+            measures.
+        step: whether steps of these come back as well.
     """
     if not model.dynamic:
         return None
     seen, layer = model.dynamic[-1]
-    own, unseen = (seen.name,), (seen.name + HIDDEN,)
-    back: list[Static | Known] = []
-    if output:
-        back.append(fed_back(layer.outputs, sees=own, name=FEEDBACK))
-    if hidden:
-        back.append(fed_back(1, sees=unseen, name=HIDDEN_FEEDBACK))
-        back += [Form("step", sees=unseen, name=STEP)] if step else []
-    return _fed_back(model, back, hidden=int(hidden))
+    count, unseen = _hidden(layer) if hidden else 0, seen.name + HIDDEN
+    functions = each_channel(FEEDBACK, seen.name, layer.outputs) if output else {}
+    functions |= each_channel(HIDDEN_FEEDBACK, unseen, count)
+    steps = each_channel(STEP, unseen, count) if step else {}
+    back: list[Static | Known] = [fed_back(1, sees=(x,), name=n) for n, x in functions.items()]
+    back += [Form("step", sees=(x,), name=name) for name, x in steps.items()]
+    return _fed_back(model, back, hidden=count)
+
+
+def with_joint_feedback(model: Model) -> Model | None:
+    """The model with a function of all outputs of its last dynamic layer that acts back on it.
+
+    As many values as outputs: a spring between two masses. None for a single output, see
+    `with_feedback`, where that is None, and where something acts back already.
+    """
+    if not model.dynamic or model.dynamic[-1][1].outputs == 1 or model.has_feedback:
+        return None
+    seen, layer = model.dynamic[-1]
+    return _fed_back(
+        model, [fed_back(layer.outputs, sees=(seen.name,), name=JOINT_FEEDBACK)], hidden=0
+    )
 
 
 def with_forms(model: Model, *, hidden: bool = False) -> Model | None:
     """The model with parametric forms of its last dynamic layer that act back on it.
 
-    None for several outputs or hidden signals, and where `with_feedback` is None.
+    None beside more hidden signals than outputs, and where `with_feedback` is None.
 
     Args:
-        model: to extend. hidden: whether some see a further signal of the same states, which
-            nothing measures; see `forms_of`.
+        model: to extend. hidden: whether some see as many further signals of the same states as it
+            has outputs, which nothing measures; see `forms_of`.
     """
     if not model.dynamic:
         return None
     seen, layer = model.dynamic[-1]
-    if layer.outputs > 1 or layer.hidden > 1:
+    if layer.hidden > layer.outputs:
         return None
-    return _fed_back(model, forms_of(seen.name, hidden=hidden), hidden=int(hidden))
+    count = _hidden(layer) if hidden else 0
+    forms = forms_of(seen.name, outputs=layer.outputs, hidden=count)
+    return _fed_back(model, forms, hidden=count)
 
 
 def with_hysteresis(model: Model) -> Model | None:
@@ -108,6 +127,11 @@ def noise_allows_feedback(model: Model) -> bool:
     return model.likelihood.gaussian and not model.likelihood.follows_output
 
 
+def _hidden(layer: Dynamic) -> int:
+    """Signals that nothing measures: those that there are, or one for each output."""
+    return layer.hidden or layer.outputs
+
+
 def _fed_back(model: Model, given: Sequence[Static | Known], *, hidden: int) -> Model | None:
     """The model with functions that act back on its last dynamic layer, but those that do.
 
@@ -119,7 +143,8 @@ def _fed_back(model: Model, given: Sequence[Static | Known], *, hidden: int) -> 
         return None
     sources = {wire.name: wire.sources for wire in model.wires}
     before = {sources[name] for name in layer.feedback}
-    back = [one for one in given if one.sees not in before]
+    # Nor functions of a channel of what one of them sees as a whole.
+    back = [one for one in given if before.isdisjoint((one.sees, (signal_of(one.sees[0]),)))]
     if not back or (model.has_feedback and not layer.feedback):
         return None
     names = (*layer.feedback, *(str(one.name) for one in back))

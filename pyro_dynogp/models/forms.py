@@ -18,6 +18,7 @@ from torch.nn.functional import softplus
 from pyro_dynogp.data.channels import Channel
 from pyro_dynogp.models.arrival import free_delays
 from pyro_dynogp.models.layer import HIDDEN, Dynamic, Known, Layer
+from pyro_dynogp.models.selection import each_channel
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
 
@@ -172,20 +173,25 @@ def Form(
     return Known(function, priors, range=ends, scaled=True, skip=skip, sees=sees, name=name)
 
 
-def forms_of(name: str, *, hidden: bool) -> list[Known]:
+def forms_of(name: str, *, outputs: int = 1, hidden: int = 0) -> list[Known]:
     """The forms that a dynamic layer usually has in feedback.
 
-    A root and an edge of its output, and of its hidden signal; a step of the latter, or of the
-    output where there is no other signal. No cube: where there is none in the plant it grows beyond
-    the data (a motor with friction: held-out data were 222 nats less probable with one).
+    A root and an edge of each output, and of each hidden signal; a step of each of the latter, or
+    of the outputs where there is no other signal. No cube: where there is none in the plant it
+    grows beyond the data (a motor with friction: held-out data were 222 nats less probable with
+    one).
 
     Args:
-        name: of the layer. hidden: whether it has a hidden signal.
+        name: of the layer. outputs, hidden: how many outputs and hidden signals it has.
     """
     # No name begins with that of the layer, as its sites do.
-    signals = {"output": name} | ({"hidden": name + HIDDEN} if hidden else {})
+    own, unseen = (
+        each_channel("output", name, outputs),
+        each_channel("hidden", name + HIDDEN, hidden),
+    )
+    signals = own | unseen
     seen: list[tuple[str, FormName]] = [(x, form) for x in signals for form in ("root", "edge")]
-    seen.append(("hidden" if hidden else "output", "step"))
+    seen += [(x, "step") for x in unseen or own]
     return [Form(form, sees=(signals[x],), name=f"{x}_{form}") for x, form in seen]
 
 

@@ -23,6 +23,7 @@ from pyro_dynogp.layers.sites import Site, Values
 from pyro_dynogp.models.forms import form_of
 from pyro_dynogp.models.layer import in_double
 from pyro_dynogp.models.product import is_product
+from pyro_dynogp.models.selection import part, signal_of
 from pyro_dynogp.models.structure import Structure
 from pyro_dynogp.models.wiring import HIDDEN, INPUTS, Known, Wire
 from pyro_dynogp.moments.functions import gauss_hermite
@@ -133,23 +134,27 @@ def known_function(
     """
     widths = {wire.name: wire.layer.outputs for wire in model.wires}
     widths |= {f"{wire.name}{HIDDEN}": layer.hidden for wire, layer in model.dynamic}
+    widths[INPUTS] = model.inputs - model.direct
     shifts, scales, middles = [], [], []
     for source in place.sources:
-        if source == INPUTS:
-            seen = slice(model.inputs - model.direct)
-            scale, middle = scaling.input_scale[seen], scaling.input_offset[seen]
-        elif source == model.measured_signal:
-            scale, middle = scaling.output_scale, scaling.output_offset
+        whole = signal_of(source)
+        measured = model.measured_signal in (source, whole)
+        own = slice(None) if source == model.measured_signal else part(source, widths[whole])
+        if whole == INPUTS:
+            scale, middle = scaling.input_scale[own], scaling.input_offset[own]
+        elif measured:
+            scale, middle = scaling.output_scale[own], scaling.output_offset[own]
         else:
-            scale, middle = np.ones(widths[source]), np.zeros(widths[source])
+            scale, middle = np.ones(widths[whole])[own], np.zeros(widths[whole])[own]
         if layer.scaled:
             scale, middle = np.ones_like(scale), np.zeros_like(middle)
         scales.append(as_tensor(scale))
         middles.append(as_tensor(middle))
-        offset = source == model.measured_signal and "offset" in values
-        shifts.append(middles[-1] + scales[-1] * values["offset"] if offset else middles[-1])
+        level = values.get("offset") if measured else None
+        shift = middles[-1] if level is None else middles[-1] + scales[-1] * level[..., own]
+        shifts.append(shift)
     batch = broadcast(*(shift.shape[:-1] for shift in shifts))
-    shift = torch.cat([part.expand(*batch, part.shape[-1]) for part in shifts], -1)
+    shift = torch.cat([one.expand(*batch, one.shape[-1]) for one in shifts], -1)
     scale_, middle_ = torch.cat(scales), torch.cat(middles)
     ends = torch.stack([middle_ - REACH * scale_, middle_ + REACH * scale_])
     if layer.range is not None:

@@ -54,7 +54,7 @@ def arrive(system: System, record: PreparedRecord) -> Arrived:
         return Arrived(system, record.scaling, record.inputs, record.scaled_inputs)
     n_u = record.inputs.shape[-1] - (0 if system.direct is None else system.direct.shape[-1])
     late = [c for c in system.delays.columns if c < n_u]
-    step, seeing = even_step(record), sum(INPUTS in w.sources for w in system.wires)
+    step, seeing = even_step(record), sum(INPUTS in w.reads for w in system.wires)
     known = len(record.surroundings.time)
     if not late or not _takes_changes(system) or (step is None and (seeing > 1 or known < 2)):
         return Arrived(system, record.scaling, *arriving(record, system.delays))
@@ -79,7 +79,7 @@ def common_step(records: Sequence[PreparedRecord]) -> float | None:
 
 def _takes_changes(system: System) -> bool:
     """Whether all that sees the inputs is dynamic layers that see nothing else."""
-    seeing = [w for w in system.wires if INPUTS in w.sources]
+    seeing = [w for w in system.wires if INPUTS in w.reads]
     layers = {wire.name for wire, _ in system.dynamic}
     plain = all(w.name in layers and w.sources == (INPUTS,) and not w.fed for w in seeing)
     likelihood = system.noise.likelihood

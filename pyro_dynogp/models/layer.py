@@ -35,7 +35,8 @@ class Dynamic:
             integrates its input (a level, a position, a charge).
         skip: names of earlier signals ("inputs", or layers) that the layer sees beside the
             output of the layer before it.
-        sees: names of the earlier signals that it sees instead, for branches side by side.
+        sees: names of the earlier signals that it sees instead, for branches side by side; "g[0]"
+            is the first channel of the signal "g", in `skip` as well.
         feedback: names of later static layers whose outputs are further inputs of this layer. Each
             acts from the sample after the one that it is computed at, and never on the output at
             once: the loop has a delay.

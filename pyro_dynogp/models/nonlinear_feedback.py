@@ -39,8 +39,8 @@ def NonlinearFeedback(
     them is what Gaussian processes are too smooth for: a friction that changes sign, an edge that
     a tank flows over.
 
-    With `parametric` nothing is a Gaussian process: what comes back are a root and an edge of the
-    output, and of the hidden signal, and a step of the latter, or of the output where there is no
+    With `parametric` nothing is a Gaussian process: what comes back are a root and an edge of each
+    output, and of each hidden signal, and a step of the latter, or of each output where there is no
     hidden signal (see `Form`). Tanks and valves need fewer data so.
 
     Arguments are those of `Wiener`. f sees all outputs and has as many; that of g is measured.
@@ -49,8 +49,8 @@ def NonlinearFeedback(
         hidden: number of signals that f2 sees and has as outputs.
         step: whether a step of the hidden signal, or of the output where there is none, comes back
             as well; by default with one hidden signal.
-        parametric: whether what comes back has parametric forms. For one output and at most one
-            hidden signal; `step`, `inducing` and `kernel` are of functions that are no such forms.
+        parametric: whether what comes back has parametric forms of one signal each; `step`,
+            `inducing` and `kernel` are of functions that are no such forms.
         substeps: equal parts of each interval between samples in which the functions are computed
             anew; by default 3 with a `Form`, 1 without and beside dead times that are parameters.
         kernel: of the functions, a gpytorch kernel; by default Matern-5/2 with a lengthscale of at
@@ -70,8 +70,8 @@ def NonlinearFeedback(
     if step is not None:
         SWITCH.check("step", step)
     if parametric:
-        _check_parametric(outputs, hidden, step, kernel, inducing)
-        functions: list[StaticLayer] = [*forms_of("g", hidden=bool(hidden))]
+        _check_parametric(step, kernel, inducing)
+        functions: list[StaticLayer] = [*forms_of("g", outputs=outputs, hidden=hidden)]
     else:
         functions = _smooth(outputs, hidden, step, inducing, kernel)
     if substeps is None:
@@ -97,7 +97,7 @@ def _smooth(
     if step and width > 1:
         raise invalid(
             "step", expected="None or False: a step sees one signal", got=f"True, {width} signals",
-            advice="A Cascade takes Form layers that see layers of one signal each.",
+            advice='A Cascade takes Form layers that see one channel each, as in sees=("g[0]",).',
         )  # fmt: skip
     step = hidden == 1 if step is None else step
     first = "f1" if hidden or step else "f"
@@ -110,16 +110,8 @@ def _smooth(
     return functions
 
 
-def _check_parametric(
-    outputs: int, hidden: int, step: bool | None, kernel: Kernel | None, inducing: int
-) -> None:
+def _check_parametric(step: bool | None, kernel: Kernel | None, inducing: int) -> None:
     """Refuse what parametric forms have no use for."""
-    if outputs > 1 or hidden > 1:
-        raise invalid(
-            "parametric", expected="False for several outputs or hidden signals",
-            got=f"True, outputs={outputs}, hidden={hidden}",
-            advice="A Cascade takes Form layers that see layers of one signal each.",
-        )  # fmt: skip
     if step is not None or kernel is not None or inducing != INDUCING:
         raise invalid(
             "parametric", expected="False beside step, kernel or inducing",

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from pyro_dynogp.models.selection import part
 from pyro_dynogp.models.wiring import INPUTS, Dynamic, Wire
 
 # What a channel is that is no static output.
@@ -27,6 +28,12 @@ class Signal:
     rows: Tensor | None
     outputs: tuple[int, ...]
 
+    def seen(self, source: str) -> Signal:
+        """What a layer sees of it: all, or a single channel."""
+        own = part(source, len(self.outputs))
+        rows = None if self.rows is None else self.rows[..., own, :]
+        return Signal(self.known[..., own], rows, self.outputs[own])
+
 
 def places_of_outputs(wires: Sequence[Wire]) -> tuple[dict[str, int], int]:
     """First place of each static layer among the random static outputs, and E, how many there are.
@@ -37,7 +44,7 @@ def places_of_outputs(wires: Sequence[Wire]) -> tuple[dict[str, int], int]:
     first: dict[str, int] = {}
     total = 0
     for place in wires:
-        sources = [random[name] for name in place.sources]
+        sources = [random[name] for name in place.reads]
         if isinstance(place.layer, Dynamic):
             total += place.channels if "trajectory" in sources else 0
             random |= dict.fromkeys(place.signals, "trajectory")

@@ -15,6 +15,7 @@ from pyro_dynogp.layers.noise import Gaussian, Likelihood
 from pyro_dynogp.models.arrival import free_delays
 from pyro_dynogp.models.prepared import PreparedRecord, Records
 from pyro_dynogp.models.priors import PriorName
+from pyro_dynogp.models.selection import place_of
 from pyro_dynogp.models.wiring import (
     INPUTS,
     Dynamic,
@@ -131,7 +132,7 @@ class Structure:
         if isinstance(wire.layer, Dynamic):
             return wire.name
         sees = isinstance(wire.layer, Known) and (wire.channels, self.outputs) == (1, 1)
-        return wire.sources[0] if sees and wire.sources != (INPUTS,) else None
+        return wire.sources[0] if sees and wire.reads.isdisjoint((INPUTS,)) else None
 
     @property
     def late(self) -> tuple[Delayed, ...]:
@@ -182,9 +183,11 @@ class Structure:
         widths[INPUTS] = self.inputs - self.direct
         order: list[int] = []
         for source in place.sources:
-            known = self.order_of_signals(widths[source], scaling)
+            known: tuple[int, ...] = (0,)
             if source == INPUTS:
                 known = tuple(u for u in scaling.input_order if u < widths[INPUTS])
+            elif place_of(source) is None:
+                known = self.order_of_signals(widths[source], scaling)
             order += [len(order) + channel for channel in known]
         return tuple(order)
 
@@ -228,7 +231,7 @@ class Structure:
             name
             for place, reader in enumerate(self.wires)
             if any(isinstance(w.layer, StaticLayer) for w in self.wires[place:])
-            for name in reader.sources
+            for name in reader.reads
         }
         return tuple(
             w for w, _ in self.dynamic if w.channels + w.fed and not names.isdisjoint(w.signals)

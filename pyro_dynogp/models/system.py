@@ -20,6 +20,7 @@ from pyro_dynogp.lti.state import ModalState
 from pyro_dynogp.models.arrival import Delays
 from pyro_dynogp.models.known import KnownFunction
 from pyro_dynogp.models.past_inputs import initial_mean, past_input_covariance, with_direct
+from pyro_dynogp.models.selection import seen
 from pyro_dynogp.models.wiring import INPUTS, Wire, substeps_of
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.shown import shown
@@ -307,5 +308,5 @@ class System:
 
 def see(signals: dict[str, Tensor], place: Wire) -> Tensor:
     """What a layer sees (*b, n, channels): its sources side by side."""
-    parts = [signals[name] for name in place.sources]
+    parts = [seen(signals, source) for source in place.sources]
     return parts[0] if len(parts) == 1 else joined(parts, 2, -1)

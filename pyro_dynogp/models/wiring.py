@@ -13,6 +13,7 @@ from pyro_dynogp.models.layer import Limits as Limits
 from pyro_dynogp.models.layer import Static as Static
 from pyro_dynogp.models.layer import StaticLayer as StaticLayer
 from pyro_dynogp.models.layer_rules import check_layer, check_limits, check_signals
+from pyro_dynogp.models.selection import part, place_of, signal_of, twice, with_channels
 from pyro_dynogp.support.errors import instance, invalid, whole
 
 INPUTS = "inputs"
@@ -26,7 +27,8 @@ class Wire:
 
     Attributes:
         name: of the layer. layer: its specification, nothing left to default.
-        sources: names of the signals it sees, in order. channels: how many they are.
+        sources: names of the signals it sees, or of single channels of them as in "g[0]", in order.
+        channels: how many channels they are.
         pathwise: whether a dynamic layer sees its output, directly or through static layers.
         last: whether its output is the model's. single: whether no other layer is of its kind.
         fed: number of channels that come back from the layers in `feedback`, after the others.
@@ -40,6 +42,11 @@ class Wire:
     last: bool
     single: bool = True
     fed: int = 0
+
+    @property
+    def reads(self) -> frozenset[str]:
+        """Names of the signals of which the layer sees something."""
+        return frozenset(map(signal_of, self.sources))
 
     @property
     def signals(self) -> dict[str, int]:
@@ -97,7 +104,7 @@ def wire(inputs: int, layers: Sequence[Layer], output: str | None = None) -> tup
     for name, layer in zip(names, layers, strict=True):
         check_layer(name, layer)
     back = {source for layer in layers if isinstance(layer, Dynamic) for source in layer.feedback}
-    width = {INPUTS: inputs}
+    width = with_channels({INPUTS: inputs})
     wires: list[Wire] = []
     before: str = INPUTS
     for place, (name, layer) in enumerate(zip(names, layers, strict=True)):
@@ -130,7 +137,7 @@ def wire(inputs: int, layers: Sequence[Layer], output: str | None = None) -> tup
         fed = sum(widths[source] for source in getattr(layer, "feedback", ()))
         single = sum(_letter(other) == _letter(layer) for other in layers) == 1
         wires.append(Wire(name, layer, sources, channels, False, last, single, fed))
-        width |= _signals(name, layer)
+        width |= with_channels(_signals(name, layer))
         before = name
     _check_that_all_matter(wires, output)
     _check_hidden(wires)
@@ -141,7 +148,7 @@ def wire(inputs: int, layers: Sequence[Layer], output: str | None = None) -> tup
         pathwise = not feeds.isdisjoint(here.signals)
         wires[place] = replace(here, pathwise=pathwise)
         if isinstance(here.layer, Dynamic) or pathwise:
-            feeds.update(here.sources)
+            feeds.update(here.reads)
     return tuple(wires)
 
 
@@ -179,11 +186,12 @@ def _check_sources(name: str, layer: Layer, width: Mapping[str, int], before: st
     option = "sees" if layer.sees else "skip"
     named = layer.sees or layer.skip
     expected = set(width) if layer.sees else set(width) - {before}
-    repeated = isinstance(named, str) or len(set(named)) < len(named)
+    repeated = isinstance(named, str) or twice(named) is not None
     for signal in [named] if repeated else [n for n in named if n not in expected]:
         raise invalid(
             f"{option} of layer {name!r}",
-            expected=f"names of earlier signals, a tuple of {sorted(expected)}",
+            expected="names of earlier signals, or of channels of them as in 'g[0]', each once: a "
+            f"tuple of {sorted(name for name in expected if place_of(name) is None)}",
             got=repr(signal),
         )
     if layer.sees and layer.skip:
@@ -228,7 +236,7 @@ def _check_that_all_matter(wires: Sequence[Wire], output: str) -> None:
     new = {output}
     while new:
         matter |= new
-        seen = {s for w in wires if w.name in new for s in (*w.sources, *w.feedback)}
+        seen = {s for w in wires if w.name in new for s in (*w.reads, *w.feedback)}
         new = {w.name for w in wires if not seen.isdisjoint(w.signals)} - matter
     idle = [w.name for w in wires if w.name not in matter]
     if idle:
@@ -241,12 +249,14 @@ def _check_that_all_matter(wires: Sequence[Wire], output: str) -> None:
 
 def _check_hidden(wires: Sequence[Wire]) -> None:
     """Refuse hidden signals that no function sees, or without feedback: nothing depends on them."""
-    seen = {source for w in wires for source in w.sources}
+    sources = {source for w in wires for source in w.sources}
     for w in wires:
-        if _hidden(w.layer) and not (w.name + HIDDEN in seen and w.feedback):
+        count, own = _hidden(w.layer), w.name + HIDDEN
+        seen = {k for s in sources if signal_of(s) == own for k in range(count)[part(s, count)]}
+        if count and not (len(seen) == count and w.feedback):
             raise invalid(
                 f"hidden of layer {w.name!r}",
-                expected=f"0, or a function that sees {w.name + HIDDEN!r} in a layer with feedback",
+                expected=f"0, or functions that see all of {own!r} in a layer with feedback",
                 got=repr(_hidden(w.layer)),
             )
 

@@ -12,7 +12,7 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.models.arrival import arriving
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.prepared import PreparedRecord
-from pyro_dynogp.models.system import DynamicSystem
+from pyro_dynogp.models.system import DynamicSystem, see
 from pyro_dynogp.prediction.first_state import beginning
 from pyro_dynogp.prediction.records import prepared
 from pyro_dynogp.support.errors import invalid
@@ -96,7 +96,8 @@ def static_function(
     found = {k: v.mean for k, v in trajectories(fit, along).items()}
     driving = fit.system.driving(arriving(along, fit.system.delays)[1])
     found["inputs"] = driving.reshape(-1, *driving.shape[-2:]).mean(0).numpy()
-    seen = np.concatenate([found[source] for source in wire.sources], -1)
+    signals = {signal: as_tensor(path) for signal, path in found.items()}
+    seen = see(signals, wire).numpy()
     low, high = seen[:, channel].min(), seen[:, channel].max()
     margin = 0.1 * (high - low)
     x = np.linspace(low - margin, high + margin, points)

@@ -238,6 +238,36 @@ class TestBlock:
             "feedback", "hidden_feedback", "feedback_step"
         )  # fmt: skip
 
+    def test_of_several_outputs_each_has_its_function(self, spring):
+        """And all have one together. Where functions act back there are those of other signals."""
+        made = EFFECT.extend(dgp.LinearDynamicGP(1, outputs=2, pairs=2), SAID, spring)
+        wired = [{w.name: w.sources for w in one.wires if w.name != "g"} for one in made]
+        own = {"feedback_1": ("g[0]",), "feedback_2": ("g[1]",)}
+        hidden = {"hidden_feedback_1": ("g_hidden[0]",), "hidden_feedback_2": ("g_hidden[1]",)}
+        steps = {"feedback_step_1": ("g_hidden[0]",), "feedback_step_2": ("g_hidden[1]",)}
+        assert wired[:2] == [own, hidden]
+        assert wired[4:6] == [hidden | steps, {"joint_feedback": ("g",)}]
+        assert [len(one) for one in wired[6:]] == [
+            6,
+            10,
+            6,
+        ]  # forms, and all smooth ones with steps
+        assert wired[-1] == own | hidden | steps
+        assert made[1].dynamic[0][1].hidden == 2
+        assert made[5].wires[1].layer.outputs == 2
+        again = EFFECT.extend(made[0], SAID, spring)
+        added = [{w.name for w in one.wires} - {"g", *own} for one in again]
+        assert added == [set(hidden), {"feedback_product"}, {"hidden_product"}]
+        assert len(EFFECT.extend(made[5], SAID, spring)) == 3  # none of what the joint one sees
+        test = "What the test said."
+        unseen = "signals of the dynamics that are not measured"
+        assert [EFFECT.sentence(SAID, one) for one in (made[0], made[1], made[5], made[-1])] == [
+            f"{test} The model has a function of each output.",
+            f"Nonlinear functions of {unseen} act back on them.",
+            test,
+            f"Nonlinear functions of each output, and of {unseen}, act back on them.",
+        ]
+
     def test_of_functions_and_products_both_are_said(self):
         model = with_products(with_feedback(dgp.LinearDynamicGP(1)))
         assert EFFECT.sentence(SAID, model) == (

@@ -15,6 +15,20 @@ from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.wiring import Dynamic, Static
 
 
+def springs(outputs, hidden=0, pairs=2, inputs=1, process_noise=True, **options):
+    """A layer g whose outputs and hidden signals come back through a function of each."""
+    seen = [*(f"g[{k}]" for k in range(outputs)), *(f"g_hidden[{k}]" for k in range(hidden))]
+    functions = [
+        Static(inducing=6, mean="linear", sees=(signal,), name=f"f{place}")
+        for place, signal in enumerate(seen)
+    ]
+    dynamic = Dynamic(
+        outputs=outputs, pairs=pairs, process_noise=process_noise, hidden=hidden,
+        feedback=tuple(one.name for one in functions),
+    )  # fmt: skip
+    return dgp.Cascade(inputs, (dynamic, *functions), output="g", **options)
+
+
 def spring(outputs=1, pairs=2, inputs=1, process_noise=True, hidden=0, both=True, **options):
     """A layer g whose output comes back through a function f of all of it.
 
@@ -120,11 +134,12 @@ class ClosedLoop:
         for name in wires["g"].feedback:  # each function's slope by all signals of the layer
             f = system.layer(name).function
             own, count = f.slope.numpy(), len(f.constant)
-            row = [
-                own if signal in wires[name].sources else np.zeros((count, width))
-                for signal, width in wires["g"].signals.items()
-            ]
-            slopes.append(np.concatenate(row, 1))
+            row = {signal: np.zeros((count, width)) for signal, width in wires["g"].signals.items()}
+            for source in wires[name].sources:
+                signal, _, place = source.rstrip("]").partition("[")
+                there = [int(place)] if place else list(range(row[signal].shape[1]))
+                row[signal][:, there], own = own[:, : len(there)], own[:, len(there) :]
+            slopes.append(np.concatenate(list(row.values()), 1))
             constants.append(f.constant.numpy())
         slope, constant = np.concatenate(slopes), np.concatenate(constants)
         D = modes.D.numpy()[:, :d]

@@ -14,17 +14,20 @@ from tests.models.closed_loops import (
     check_gradient,
     make_record,
     spring,
+    springs,
     system_at,
     values_of,
 )
 
 CASES = [(1, 1, False, {}), (1, 1, True, {}), (2, 1, False, {}), (2, 2, True, {}),
          (1, 1, False, {"hidden": 1}), (1, 2, True, {"hidden": 1, "both": False}),
-         (2, 1, True, {"hidden": 2})]  # fmt: skip
+         (2, 1, True, {"hidden": 2}), (2, 2, True, {"each": True}),
+         (2, 1, False, {"each": True, "hidden": 2})]  # fmt: skip
 
 
-def line_case(outputs, inputs, irregular, **options):
-    model = spring(outputs, inputs=inputs, **options)
+def line_case(outputs, inputs, irregular, each=False, **options):
+    make = springs if each else spring
+    model = make(outputs, inputs=inputs, **options)
     record = make_record(inputs, outputs, irregular=irregular)
     model = model.scaled_to(record)
     system = system_at(model, values_of(model, record, seed=outputs + 2 * irregular))

@@ -135,9 +135,14 @@ def test_the_parametric_model_has_them_alone():
     alone = dgp.NonlinearFeedback(1, parametric=True, substeps=2)
     assert [w.name for w in alone.wires] == ["g", "output_root", "output_edge", "output_step"]
     assert alone.wires[0].layer.substeps == 2
-    for options in ({"hidden": 2}, {"outputs": 2}):
-        with pytest.raises(ValueError, match="parametric: expected False for several outputs or"):
-            dgp.NonlinearFeedback(1, parametric=True, **options)
+    wires = dgp.NonlinearFeedback(1, outputs=2, hidden=1, parametric=True).wires
+    assert {w.name: w.sources for w in wires if w.name != "g"} == {
+        "output_1_root": ("g[0]",), "output_1_edge": ("g[0]",),
+        "output_2_root": ("g[1]",), "output_2_edge": ("g[1]",),
+        "hidden_root": ("g_hidden",), "hidden_edge": ("g_hidden",), "hidden_step": ("g_hidden",),
+    }  # fmt: skip
+    names = [w.name for w in dgp.NonlinearFeedback(1, outputs=2, parametric=True).wires]
+    assert names[-2:] == ["output_1_step", "output_2_step"]
     for options in ({"step": False}, {"inducing": 8}, {"kernel": gpytorch.kernels.RBFKernel()}):
         with pytest.raises(ValueError, match="parametric: expected False beside step, kernel or"):
             dgp.NonlinearFeedback(1, parametric=True, **options)
@@ -161,7 +166,9 @@ def test_the_loop_adds_those_that_a_model_lacks():
     names = {w.name for w in with_forms(with_feedback(model), hidden=True).wires}
     assert names == {"g", "feedback", "hidden_root", "hidden_edge", "hidden_step"}
     assert with_forms(with_forms(model)) is with_forms(with_feedback(model)) is None
-    assert with_forms(dgp.LinearDynamicGP(1, outputs=2)) is None
+    ready = dgp.NonlinearFeedback(1, outputs=2, hidden=2, parametric=True)
+    each = with_forms(dgp.LinearDynamicGP(1, outputs=2), hidden=True)
+    assert [(w.name, w.sources) for w in each.wires] == [(w.name, w.sources) for w in ready.wires]
     assert with_forms(dgp.NonlinearFeedback(1, hidden=2)) is None
 
 

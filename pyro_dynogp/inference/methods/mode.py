@@ -51,7 +51,7 @@ CARRIED = 3
 # Restarts of models with functions, and of those with feedback of measured signals alone. Hidden
 # ones have more poor optima (tanks that overflow: errors of 22.7 and 2.1 times the noise with four
 # restarts, and of 4.6 and 1.1 times with eight, for a fifth more time).
-# Of several hidden signals fewer still lead to the best optimum: a sixth to a half.
+# Of more hidden signals than outputs fewer still lead to the best optimum: a sixth to a half.
 CURVED, LOOPED, HIDDEN = 8, 4, 16
 # Sets of restarts, until a model with functions beats the linear one in free runs, and what is said
 # where none does.
@@ -204,9 +204,9 @@ def cascade_optima(problem: Problem, run: Run, optimizer: Optimizer, steps: int)
     left out. Where none remains there is another set of starts, and then a warning.
     """
     model, records, learnt = problem.target, problem.records, problem.learnt
-    hidden = max((layer.hidden for _, layer in model.dynamic), default=0)
-    unseen = model.has_real_poles or hidden > 0
-    several = LOOPED if model.has_feedback and not unseen else HIDDEN if hidden > 1 else CURVED
+    unseen = model.has_real_poles or any(layer.hidden for _, layer in model.dynamic)
+    many = any(layer.hidden > layer.outputs for _, layer in model.dynamic)
+    several = LOOPED if model.has_feedback and not unseen else HIDDEN if many else CURVED
     usual = several if model.has_function else RANDOM
     optima: list[Optimum] = []
     least = math.inf

@@ -134,7 +134,9 @@ class DynamicStart:
         # Drawn for all, so that a signal's gains do not depend on how many are known.
         gain = torch.cat([own, self._random(layer.width, P, 2, scale=OTHERS)[known:]])
         if layer.hidden:
-            measured = own[self._signals[0] if known > 1 else 0]
+            # As many as outputs go by these, in their order.
+            places = range(known) if layer.hidden == known else self._signals[:known]
+            measured = torch.stack([own[place] for place in places[: layer.hidden]])
             gain[-layer.hidden :] = self._hidden(values, measured, ahead)
         length = gain.square().sum((0, -1)).sqrt()  # directions have unit length
         found = {
@@ -151,23 +153,23 @@ class DynamicStart:
         return found
 
     def _hidden(self, values: Values, measured: Tensor, ahead: bool) -> Tensor:
-        """Gains (h, P, 2) of an output's derivative by time, over the middle of the poles' sizes.
+        """Gains (h, P, 2) of outputs' derivatives by time, over the middle of the poles' sizes.
 
-        That is a velocity where a position is measured. `ahead`, of one signal: with the output
-        itself added, it is that of a first-order lag before: a level in the tank above. Of several
-        the first is the derivative, and others are about the output itself, as a force that the
-        position makes.
+        That is a velocity where a position is measured. `ahead`, of no more signals than outputs:
+        with the output itself added, it is that of a first-order lag before: a level in the tank
+        above. Of more signals than outputs the others are about the first output itself, as a force
+        that the position makes.
 
         Args:
-            measured: (P, 2), gains of the output: real and imaginary part.
+            measured: (c, P, 2), gains of outputs, at most h: real and imaginary part.
         """
         decay, frequency = (values[self._key(x)].exp() for x in ("log_decay", "log_frequency"))
         pole = torch.complex(-decay, frequency)
-        count = self.layer.hidden
-        share = pole / pole.abs().median() + float(ahead and count == 1)
-        derivative = torch.view_as_real(share * torch.view_as_complex(measured.contiguous()))
-        others = measured + self._random(count - 1, *measured.shape, scale=AROUND)
-        return torch.cat([derivative.unsqueeze(0), others])
+        more = self.layer.hidden - len(measured)
+        share = pole / pole.abs().median() + float(ahead and more == 0)
+        derivatives = torch.view_as_real(share * torch.view_as_complex(measured.contiguous()))
+        others = measured[0] + self._random(more, *measured.shape[1:], scale=AROUND)
+        return torch.cat([derivatives, others])
 
     def _fed_back(self, gain: Tensor) -> Tensor:
         """Gains (P, d + fed, 2): what comes back acts somewhat as the inputs do, sign at random.

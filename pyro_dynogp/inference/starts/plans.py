@@ -20,6 +20,7 @@ from pyro_dynogp.models.assembly import assemble
 from pyro_dynogp.models.known import known_function, known_sites, middle_of
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord
+from pyro_dynogp.models.selection import signal_of
 from pyro_dynogp.models.system import DynamicSystem, see
 from pyro_dynogp.models.wiring import INPUTS, Dynamic, Known, Static, Wire
 from pyro_dynogp.moments import filtering, smoothing
@@ -106,6 +107,7 @@ def starting_point(model: Model, records: Sequence[PreparedRecord], plan: Plan) 
     size = 1.0  # what signals below the leading layer were divided by
     level = torch.zeros(model.outputs, dtype=torch.float64)
     back = {name for one in model.wires for name in one.feedback}
+    last = model.output_wire.name
     if plan.linear is not None:
         level = level + plan.linear["offset"]
     for one in model.wires:
@@ -123,7 +125,7 @@ def starting_point(model: Model, records: Sequence[PreparedRecord], plan: Plan) 
             outputs = [start.response(values, r, x) for r, x in zip(records, seen, strict=True)]
             factor = size
             # Unit scale for the layer above, and of what does not begin at the linear fit.
-            if one.name != model.measured_signal or one.layer.real:
+            if one.name != signal_of(model.measured_signal or "") or one.layer.real:
                 factor = 1.0 / max(float(torch.cat(outputs).std()), 1e-6)
                 size = size / factor
             start.scale(values, factor)
@@ -135,9 +137,10 @@ def starting_point(model: Model, records: Sequence[PreparedRecord], plan: Plan) 
             function = known_function(model, one, one.layer, values, scaling)
             outputs = [function.mean(s) for s in seen]
         else:
-            if one.sources == (model.output_wire.name,):  # seen where it was measured
+            if one.reads == {last}:  # seen where it was measured
                 known = [
-                    torch.where(y.isnan(), s, y - level) for y, s in zip(targets, seen, strict=True)
+                    see({last: torch.where(y.isnan(), s[last], y - level)}, one)
+                    for y, s in zip(targets, signals, strict=True)
                 ]
                 seen = known if one.name in back else seen
             line = (size, level) if one.last else None
@@ -148,7 +151,6 @@ def starting_point(model: Model, records: Sequence[PreparedRecord], plan: Plan) 
         for signal, out in zip(signals, outputs, strict=True):
             parts = out.split(list(one.signals.values()), -1)
             signal |= dict(zip(one.signals, parts, strict=True))
-    last = model.output_wire.name
     if model.measured_signal is not None:
         values["offset"] = level
     if plan.linear is not None and not plan.curved:
