@@ -17,6 +17,7 @@ from pyro_dynogp.effects.feedback_sentence import what_acts_back
 from pyro_dynogp.lti.views import steady_state_gain
 from pyro_dynogp.models.compartments import in_place_of
 from pyro_dynogp.models.feedback_variants import (
+    with_cubes,
     with_feedback,
     with_forms,
     with_hysteresis,
@@ -171,9 +172,10 @@ class NonlinearFeedbackOfOutput(Effect):
 
     A function of the output, of a signal of the same states that nothing measures (a velocity, the
     level of another tank), or one of each, of several outputs one function for each and one of all
-    together; roots, edges and steps of both; products of the inputs
-    with the output, and with each other, or with such a signal; two compartments in place of linear
-    dynamics; a hysteresis of two such signals. A later one only where it is certainly better.
+    together; a cube of either, which is fitted in seconds and holds beyond the data; roots, edges
+    and steps of both; products of the inputs with the output, and with each other, or with such a
+    signal; two compartments in place of linear dynamics; a hysteresis of two such signals. A later
+    one only where it is certainly better.
     """
 
     name = "nonlinear feedback"
@@ -202,7 +204,8 @@ class NonlinearFeedbackOfOutput(Effect):
         alone, stepped = (
             with_feedback(model, output=False, hidden=True, step=step) for step in (False, True)
         )
-        functions = [with_feedback(model), alone]
+        cubes = [with_cubes(model), with_cubes(model, hidden=True)]
+        functions = [with_feedback(model), cubes[0], alone, cubes[1]]
         products = [
             with_products(model),
             with_products_of_inputs(model, record),

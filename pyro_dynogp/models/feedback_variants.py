@@ -13,11 +13,11 @@ from pyro_dynogp.models.selection import each_channel, signal_of
 from pyro_dynogp.models.variants import with_dynamics
 from pyro_dynogp.models.wiring import HIDDEN, INPUTS, Dynamic, Known, Layer, Static, Wire
 
-# Names of functions that act back: of a layer's outputs, of signals of it that are hidden, and of
-# steps of the latter, of all outputs together, a hysteresis of two hidden signals, and products of
+# Names of functions that act back: of a layer's outputs, of signals of it that are hidden, steps of
+# the latter, of all outputs together, cubes, a hysteresis of two hidden signals, and products of
 # inputs with the output or with a hidden signal.
 FEEDBACK, HIDDEN_FEEDBACK, STEP = "feedback", "hidden_feedback", "feedback_step"
-JOINT_FEEDBACK = "joint_feedback"
+JOINT_FEEDBACK, CUBE, HIDDEN_CUBE = "joint_feedback", "feedback_cube", "hidden_cube"
 HYSTERESIS = "feedback_hysteresis"
 PRODUCT, HIDDEN_PRODUCT = "feedback_product", "hidden_product"
 
@@ -80,6 +80,28 @@ def with_forms(model: Model, *, hidden: bool = False) -> Model | None:
     count = _hidden(layer) if hidden else 0
     forms = forms_of(seen.name, outputs=layer.outputs, hidden=count)
     return _fed_back(model, forms, hidden=count)
+
+
+def with_cubes(model: Model, *, hidden: bool = False) -> Model | None:
+    """The model with a cube of each output of its last dynamic layer that acts back on it.
+
+    A spring that hardens or softens, and does so beyond the data as well, where a Gaussian process
+    keeps its value. None where `with_feedback` is None.
+
+    Args:
+        model: to extend. hidden: whether cubes are of as many further signals of the same states as
+            it has outputs, which nothing measures, in place of outputs: springs between masses.
+    """
+    if not model.dynamic:
+        return None
+    seen, layer = model.dynamic[-1]
+    if hidden:
+        count = _hidden(layer)
+        signals = each_channel(HIDDEN_CUBE, seen.name + HIDDEN, count)
+    else:
+        count, signals = 0, each_channel(CUBE, seen.name, layer.outputs)
+    cubes = [Form("cube", sees=(signal,), name=name) for name, signal in signals.items()]
+    return _fed_back(model, cubes, hidden=count)
 
 
 def with_hysteresis(model: Model) -> Model | None:

@@ -172,17 +172,24 @@ class TestDetection:
         assert 0.0 < nonlinear_feedback(r, SETTINGS).p_value <= 1.0
 
 
+# What comes first: functions and cubes of the output and of a hidden signal; products with both.
+FUNCTIONS = ["feedback", "feedback_cube", "hidden_feedback", "hidden_cube"]
+PRODUCTS = ["feedback_product", "hidden_product"]
+
+
 class TestBlock:
     def test_functions_see_the_output_a_hidden_signal_or_both_and_come_back(self, spring):
         variants = EFFECT.extend(dgp.LinearDynamicGP(1, pairs=2), SAID, spring)
         wired = [{w.name: (w.sources, w.feedback) for w in model.wires} for model in variants]
         output, hidden = (("g",), ()), (("g_hidden",), ())
-        unseen = ("hidden_feedback", "feedback_step")
+        unseen, cube = ("hidden_feedback", "feedback_step"), ("feedback_cube",)
         forms = ("output_root", "output_edge", "output_step")
         more = (*forms[:2], "hidden_root", "hidden_edge", "hidden_step")
         assert wired == [
             {"g": (("inputs",), ("feedback",)), "feedback": output},
+            {"g": (("inputs",), cube), cube[0]: output},
             {"g": (("inputs",), unseen[:1]), unseen[0]: hidden},
+            {"g": (("inputs",), ("hidden_cube",)), "hidden_cube": hidden},
             {"g": (("inputs",), ("feedback_product",)),
              "feedback_product": (("inputs", "g"), ())},
             {"g": (("inputs",), ("hidden_product",)),
@@ -196,14 +203,16 @@ class TestBlock:
             {"g": (("inputs",), ("feedback", *unseen)), "feedback": output,
              **dict.fromkeys(unseen, hidden)},
         ]  # fmt: skip
-        for model in (*variants[:7], *variants[8:]):
+        for model in (*variants[:9], *variants[10:]):
             assert model.output_wire.name == "g"
             assert model.dynamic[0][1].pairs == 2
         said = [EFFECT.sentence(SAID, model) for model in variants]
         assert said == [
             "What the test said.",
+            "What the test said.",
             unseen := "A nonlinear function of a signal of the dynamics of 'x' that is not "
             "measured acts back on them.",
+            unseen,
             "Inputs times 'x' act back on its dynamics.",
             "Inputs times a signal of the dynamics of 'x' that is not measured act back on its "
             "dynamics.",
@@ -221,10 +230,10 @@ class TestBlock:
     @pytest.mark.parametrize(
         ("share", "leading"),
         [
-            (1.0, ["feedback_product", "hidden_product", "feedback", "hidden_feedback"]),
-            (0.99, ["feedback", "hidden_feedback", "feedback_product", "hidden_product"]),
-            (0.5, ["feedback", "hidden_feedback", "feedback_product", "hidden_product"]),
-            (0.49, ["feedback", "hidden_feedback"]),
+            (1.0, [*PRODUCTS, *FUNCTIONS]),
+            (0.99, [*FUNCTIONS, *PRODUCTS]),
+            (0.5, [*FUNCTIONS, *PRODUCTS]),
+            (0.49, FUNCTIONS),
         ],
     )
     def test_products_are_tried_by_what_the_test_says_of_them(self, spring, share, leading):
@@ -245,23 +254,25 @@ class TestBlock:
         own = {"feedback_1": ("g[0]",), "feedback_2": ("g[1]",)}
         hidden = {"hidden_feedback_1": ("g_hidden[0]",), "hidden_feedback_2": ("g_hidden[1]",)}
         steps = {"feedback_step_1": ("g_hidden[0]",), "feedback_step_2": ("g_hidden[1]",)}
-        assert wired[:2] == [own, hidden]
-        assert wired[4:6] == [hidden | steps, {"joint_feedback": ("g",)}]
-        assert [len(one) for one in wired[6:]] == [
+        cube = {f"feedback_cube_{k + 1}": own[f"feedback_{k + 1}"] for k in range(2)}
+        cubed = {f"hidden_cube_{k + 1}": (f"g_hidden[{k}]",) for k in range(2)}
+        assert wired[:4] == [own, cube, hidden, cubed]
+        assert wired[6:8] == [hidden | steps, {"joint_feedback": ("g",)}]
+        assert [len(one) for one in wired[8:]] == [
             6,
             10,
             6,
         ]  # forms, and all smooth ones with steps
         assert wired[-1] == own | hidden | steps
-        assert made[1].dynamic[0][1].hidden == 2
-        assert made[5].wires[1].layer.outputs == 2
+        assert made[2].dynamic[0][1].hidden == 2
+        assert made[7].wires[1].layer.outputs == 2
         again = EFFECT.extend(made[0], SAID, spring)
         added = [{w.name for w in one.wires} - {"g", *own} for one in again]
-        assert added == [set(hidden), {"feedback_product"}, {"hidden_product"}]
-        assert len(EFFECT.extend(made[5], SAID, spring)) == 3  # none of what the joint one sees
+        assert added == [set(hidden), set(cubed), {"feedback_product"}, {"hidden_product"}]
+        assert len(EFFECT.extend(made[7], SAID, spring)) == 4  # none of what the joint one sees
         test = "What the test said."
         unseen = "signals of the dynamics that are not measured"
-        assert [EFFECT.sentence(SAID, one) for one in (made[0], made[1], made[5], made[-1])] == [
+        assert [EFFECT.sentence(SAID, one) for one in (made[0], made[2], made[7], made[-1])] == [
             f"{test} The model has a function of each output.",
             f"Nonlinear functions of {unseen} act back on them.",
             test,
@@ -277,7 +288,16 @@ class TestBlock:
     def test_what_is_there_is_not_added_again(self, spring):
         """To a function of the output one of a hidden signal, and the other way round."""
         made = EFFECT.extend(dgp.LinearDynamicGP(1), SAID, spring)
-        first, second, product, hidden, _, forms, more, chain, past, both = made
+        first, cube, second, cubed, product, hidden, _, forms, more, chain, past, both = made
+        for model, one, other in (
+            (cube, "feedback_cube", "hidden_feedback"), (cubed, "hidden_cube", "feedback")
+        ):  # fmt: skip
+            # A function of what the cube sees is none that is new.
+            added = [
+                set(x.dynamic[0][0].feedback) - {one} for x in EFFECT.extend(model, SAID, spring)
+            ]
+            assert added[0] == {other}
+            assert not any({"feedback", "hidden_feedback"} <= names for names in added)
         back = {"feedback", "hidden_feedback", "feedback_step"}
         products = [{"feedback_product"}, {"hidden_product"}]
         of_output = {"output_root", "output_edge", "output_step"}
@@ -286,7 +306,11 @@ class TestBlock:
             own = set(model.dynamic[0][0].feedback)
             extended = EFFECT.extend(model, SAID, spring)
             made = [set(one.dynamic[0][0].feedback) for one in extended]
-            assert made[:3] == [back - {"feedback_step"}, own | products[0], own | products[1]]
+            cubes = {"hidden_cube"} if model is first else {"feedback_cube"}
+            assert made[:4] == [
+                back - {"feedback_step"}, own | cubes, own | products[0],
+                own | products[1],
+            ]  # fmt: skip
             assert (back in made) == (model is first)
             assert own | others in made
             assert extended[0].dynamic[0][1].hidden == 1
@@ -294,7 +318,7 @@ class TestBlock:
         assert of_output | of_hidden in made
         for model in (more, both):
             assert len(EFFECT.extend(model, SAID, spring)) == 2  # products
-        assert len(EFFECT.extend(product, SAID, spring)) == 8
+        assert len(EFFECT.extend(product, SAID, spring)) == 10
         added = [one.dynamic[0][0].feedback for one in EFFECT.extend(past, SAID, spring)]
         assert ("feedback_hysteresis", "feedback") in added
         assert all(one.count("feedback_hysteresis") == 1 and len(one) > 1 for one in added)
