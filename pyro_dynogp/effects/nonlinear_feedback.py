@@ -17,14 +17,14 @@ from pyro_dynogp.effects.feedback_sentence import what_acts_back
 from pyro_dynogp.lti.views import steady_state_gain
 from pyro_dynogp.models.compartments import in_place_of
 from pyro_dynogp.models.feedback_variants import (
-    with_cubes,
     with_feedback,
+    with_form,
     with_forms,
     with_hysteresis,
     with_joint_feedback,
     with_products,
 )
-from pyro_dynogp.models.forms import hysteresis
+from pyro_dynogp.models.forms import FormName, hysteresis
 from pyro_dynogp.models.product import is_product
 from pyro_dynogp.models.system import DynamicSystem
 from pyro_dynogp.models.variants import Model
@@ -48,6 +48,8 @@ NAMES = ("low end", "middle", "high end")
 LAGS = 7
 # Standard errors by which two of their slopes must differ to be said to.
 CERTAIN = 2.0
+# Forms that are tried alone: a spring, a friction, an outflow.
+SIMPLE: tuple[FormName, ...] = ("cube", "step", "root")
 # Compartments of a chain.
 CHAIN = 2
 # Share of what the best column gains from which on products are tried beside functions.
@@ -172,10 +174,10 @@ class NonlinearFeedbackOfOutput(Effect):
 
     A function of the output, of a signal of the same states that nothing measures (a velocity, the
     level of another tank), or one of each, of several outputs one function for each and one of all
-    together; a cube of either, which is fitted in seconds and holds beyond the data; roots, edges
-    and steps of both; products of the inputs with the output, and with each other, or with such a
-    signal; two compartments in place of linear dynamics; a hysteresis of two such signals. A later
-    one only where it is certainly better.
+    together; a cube, a step or a root of either, which are fitted in seconds and hold beyond the
+    data; roots, edges and steps of both; products of the inputs with the output, and with each
+    other, or with such a signal; two compartments in place of linear dynamics; a hysteresis of two
+    such signals. A later one only where it is certainly better.
     """
 
     name = "nonlinear feedback"
@@ -204,8 +206,8 @@ class NonlinearFeedbackOfOutput(Effect):
         alone, stepped = (
             with_feedback(model, output=False, hidden=True, step=step) for step in (False, True)
         )
-        cubes = [with_cubes(model), with_cubes(model, hidden=True)]
-        functions = [with_feedback(model), cubes[0], alone, cubes[1]]
+        simple = [with_form(model, form, hidden=h) for h in (False, True) for form in SIMPLE]
+        functions = [with_feedback(model), *simple, alone]
         products = [
             with_products(model),
             with_products_of_inputs(model, record),

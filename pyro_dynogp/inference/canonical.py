@@ -136,8 +136,8 @@ class Canonical:
             places[f"{wire.name}_output"] = joined(tuple(wire.signals))
         for wire, layer in model.dynamic:
             pairs, levels = torch.arange(layer.pairs), torch.arange(0)
-            if layer.integrators:  # one of each signal, between real and imaginary parts of pairs
-                levels = layer.pairs + places[f"{wire.name}_output"]
+            if layer.integrators:  # one of each output, between real and imaginary parts of pairs
+                levels = layer.pairs + torch.tensor(signals[wire.name])
             imaginary = layer.pairs + len(levels) + pairs
             places[wire.dims["state"]] = torch.cat(
                 [pairs, levels] if layer.real else [pairs, levels, imaginary]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from pyro_dynogp.models.forms import Form, form_of, forms_of, usual_substeps
+from pyro_dynogp.models.forms import Form, FormName, form_of, forms_of, signals_of, usual_substeps
 from pyro_dynogp.models.layer import fed_back
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.product import Product, is_product
@@ -14,10 +14,10 @@ from pyro_dynogp.models.variants import with_dynamics
 from pyro_dynogp.models.wiring import HIDDEN, INPUTS, Dynamic, Known, Layer, Static, Wire
 
 # Names of functions that act back: of a layer's outputs, of signals of it that are hidden, steps of
-# the latter, of all outputs together, cubes, a hysteresis of two hidden signals, and products of
+# the latter, of all outputs together, a hysteresis of two hidden signals, and products of
 # inputs with the output or with a hidden signal.
 FEEDBACK, HIDDEN_FEEDBACK, STEP = "feedback", "hidden_feedback", "feedback_step"
-JOINT_FEEDBACK, CUBE, HIDDEN_CUBE = "joint_feedback", "feedback_cube", "hidden_cube"
+JOINT_FEEDBACK = "joint_feedback"
 HYSTERESIS = "feedback_hysteresis"
 PRODUCT, HIDDEN_PRODUCT = "feedback_product", "hidden_product"
 
@@ -82,26 +82,25 @@ def with_forms(model: Model, *, hidden: bool = False) -> Model | None:
     return _fed_back(model, forms, hidden=count)
 
 
-def with_cubes(model: Model, *, hidden: bool = False) -> Model | None:
-    """The model with a cube of each output of its last dynamic layer that acts back on it.
+def with_form(model: Model, form: FormName, *, hidden: bool = False) -> Model | None:
+    """The model with one form of each output of its last dynamic layer that acts back on it.
 
-    A spring that hardens or softens, and does so beyond the data as well, where a Gaussian process
-    keeps its value. None where `with_feedback` is None.
+    A cube is a spring that hardens or softens, a step friction, a root an outflow. They have a
+    place and at most a width, are fitted in seconds, and hold beyond the data, where a Gaussian
+    process keeps its value. None where `with_feedback` is None.
 
     Args:
-        model: to extend. hidden: whether cubes are of as many further signals of the same states as
-            it has outputs, which nothing measures, in place of outputs: springs between masses.
+        model: to extend. form: of one signal, see `Form`.
+        hidden: whether they are of as many further signals of the same states as it has outputs,
+            which nothing measures, in place of the outputs.
     """
     if not model.dynamic:
         return None
     seen, layer = model.dynamic[-1]
-    if hidden:
-        count = _hidden(layer)
-        signals = each_channel(HIDDEN_CUBE, seen.name + HIDDEN, count)
-    else:
-        count, signals = 0, each_channel(CUBE, seen.name, layer.outputs)
-    cubes = [Form("cube", sees=(signal,), name=name) for name, signal in signals.items()]
-    return _fed_back(model, cubes, hidden=count)
+    outputs, count = (0, _hidden(layer)) if hidden else (layer.outputs, 0)
+    signals = signals_of(seen.name, outputs=outputs, hidden=count)
+    given = [Form(form, sees=(x,), name=f"{form}_of_{label}") for label, x in signals.items()]
+    return _fed_back(model, given, hidden=count)
 
 
 def with_hysteresis(model: Model) -> Model | None:

@@ -184,15 +184,20 @@ def forms_of(name: str, *, outputs: int = 1, hidden: int = 0) -> list[Known]:
     Args:
         name: of the layer. outputs, hidden: how many outputs and hidden signals it has.
     """
-    # No name begins with that of the layer, as its sites do.
-    own, unseen = (
-        each_channel("output", name, outputs),
-        each_channel("hidden", name + HIDDEN, hidden),
-    )
-    signals = own | unseen
+    signals = signals_of(name, outputs=outputs, hidden=hidden)
     seen: list[tuple[str, FormName]] = [(x, form) for x in signals for form in ("root", "edge")]
-    seen += [(x, "step") for x in unseen or own]
+    stepped = signals_of(name, outputs=0 if hidden else outputs, hidden=hidden)
+    seen += [(x, "step") for x in stepped]
     return [Form(form, sees=(signals[x],), name=f"{x}_{form}") for x, form in seen]
+
+
+def signals_of(name: str, *, outputs: int, hidden: int) -> dict[str, str]:
+    """Signals of a dynamic layer, of one channel each, by labels for functions of them.
+
+    No label begins with the name of the layer, as its sites do.
+    """
+    own = each_channel("output", name, outputs)
+    return own | each_channel("hidden", name + HIDDEN, hidden)
 
 
 def form_of(layer: Layer) -> FormName | None:

@@ -32,7 +32,7 @@ class Dynamic:
         feedthrough: whether the layer's input acts on its output at once.
         process_noise: whether there is any.
         integrators: 1 for a pole at zero beside the pairs, one for each output: of a plant that
-            integrates its input (a level, a position, a charge).
+            integrates its input (a level, a position, a charge). Hidden signals do not see it.
         skip: names of earlier signals ("inputs", or layers) that the layer sees beside the
             output of the layer before it.
         sees: names of the earlier signals that it sees instead, for branches side by side; "g[0]"
@@ -78,9 +78,17 @@ class Dynamic:
         return self.outputs + self.hidden
 
     @property
+    def levels(self) -> int:
+        """Number of integrators: one for each output, where there are any.
+
+        Hidden signals have none: where an output integrates nothing depends on its level.
+        """
+        return self.integrators * self.outputs
+
+    @property
     def modes(self) -> int:
         """Number of poles that stand for pairs: an integrator counts, and its random walk."""
-        return self.pairs + self.integrators * self.width * (2 if self.process_noise else 1)
+        return self.pairs + self.levels * (2 if self.process_noise else 1)
 
     @property
     def past_states(self) -> tuple[int, ...]:
@@ -88,7 +96,7 @@ class Dynamic:
 
         That of an integrator is real, and its random walk has no input; that of a real pole is.
         """
-        real = self.pairs + self.integrators * self.width
+        real = self.pairs + self.levels
         imaginary = 0 if self.real else self.pairs
         return (*range(real), *range(self.modes, self.modes + imaginary))
 

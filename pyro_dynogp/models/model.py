@@ -220,7 +220,7 @@ class Model(Structure):
             time_scale=TimeScale.of(scaling),
             priors=self.priors,
             fed=place.fed,
-            integrators=layer.integrators,
+            levels=layer.levels,
             late=tuple(column for column in columns if column < place.channels),
             reference=self.reference_of(layer, scaling),
             real=layer.real,

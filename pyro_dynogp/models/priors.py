@@ -113,7 +113,8 @@ class ModesPrior:
         fed: how many of the inputs, the last ones, come back and have no direct path.
         late: columns of inputs whose dead time is a parameter: with a direct path a later first
             effect and another dead time would be the same, and they have none.
-        integrators: 1 for an integrator of each output, else 0.
+        levels: number of integrators, one for each of the first outputs: n_y, less those that are
+            hidden signals, or 0.
         process_noise: whether there is process noise at all.
         time_scale: step and duration of the record [s].
         gain_scale: of the gains of an input a priori.
@@ -140,7 +141,7 @@ class ModesPrior:
     gain_scale: float = GAIN_SCALE
     priors: PriorName = "default"
     fed: int = 0
-    integrators: int = 0
+    levels: int = 0
     late: tuple[int, ...] = ()
     reference: int = 0
     real: bool = False
@@ -187,7 +188,7 @@ class ModesPrior:
                 sites.append(Site(f"{name}_feedthrough", direct, over, growth=0.0))
         if self.process_noise:
             # The sign of a Brownian motion, and of a zero, cannot be seen in a covariance.
-            single = self.pairs + self.integrators == 1 or self.noise == "independent"
+            single = self.pairs + self.levels == 1 or self.noise == "independent"
             sites += horseshoe_sites(
                 f"{name}_noise_gain", P, self.brownian, terms,
                 dims=named("pair", "brownian", "term"),
@@ -198,15 +199,16 @@ class ModesPrior:
             direction = _normal(1.0, self.outputs, P, 2)
             over = named("output", "pair", "part")
             sites.append(Site(f"{name}_output_gain", direction, over))
-        if self.integrators:
-            wide, n_y = FLAT if flat else 1.0, self.outputs or 1
-            prior = _normal(wide, n_y)
-            sites.append(Site(f"{name}_integrator_drift", prior, named("output")))
+        if self.levels:
+            wide, count = FLAT if flat else 1.0, self.levels
+            level = dims.get("level", dims.get("output", "output"))
+            prior = _normal(wide, count)
+            sites.append(Site(f"{name}_integrator_drift", prior, (level,)))
             if n_u:
-                prior, over = _normal(wide, n_y, n_u), named("output", "input")
+                prior, over = _normal(wide, count, n_u), (level, *named("input"))
                 sites.append(Site(f"{name}_integrator_gain", prior, over, growth=0.0))
             if self.process_noise:
-                prior, over = _normal(wide, n_y, self.brownian), named("output", "brownian")
+                prior, over = _normal(wide, count, self.brownian), (level, *named("brownian"))
                 sites.append(Site(f"{name}_integrator_noise", prior, over))
         return tuple(sites)
 
@@ -256,7 +258,7 @@ class ModesPrior:
             c = c.expand(poles.shape)
         else:
             c = unit_direction(_complex(values[f"{name}_output_gain"]), self.reference)
-        if self.integrators:
+        if self.levels:
             poles, B, c, L, drift = self._with_integrators(values, poles, B, c, L)
         D = values.get(f"{name}_feedthrough")
         if D is not None and len(self._prompt) < self.inputs:
@@ -266,24 +268,24 @@ class ModesPrior:
     def _with_integrators(
         self, values: Values, poles: Tensor, B: Tensor | None, c: Tensor, L: Tensor | None
     ) -> tuple[Tensor, Tensor | None, Tensor, Tensor | None, Tensor]:
-        """Poles and gains with an integrator for each output, then a random walk for each."""
-        n_y, duration = self.outputs or 1, self.time_scale.duration
+        """Poles and gains with an integrator for each level, then a random walk for each."""
+        count, duration = self.levels, self.time_scale.duration
         rates = [0.0] if L is None else [0.0, -WALK / duration]
-        new = torch.tensor(rates, dtype=torch.float64).repeat_interleave(n_y).to(poles)
+        new = torch.tensor(rates, dtype=torch.float64).repeat_interleave(count).to(poles)
         scale = 0.5 * self.time_scale.typical_rate
         silent = torch.zeros(1, 1, dtype=torch.complex128)
         poles = joined([poles, new], 1, -1)
-        own = torch.eye(n_y).repeat(1, len(rates)).to(c)
+        own = torch.eye(self.outputs or 1, count).repeat(1, len(rates)).to(c)
         c = joined([c, own[0] if self.outputs is None else own], 1 + (self.outputs is not None), -1)
         if B is not None:
             gain = scale * values[f"{self.name}_integrator_gain"]
-            rest = silent.expand((len(rates) - 1) * n_y, self.inputs)
+            rest = silent.expand((len(rates) - 1) * count, self.inputs)
             B = joined([B, gain.to(B), rest], 2, -2)
         if L is not None:
             walk = values[f"{self.name}_integrator_noise"] * 0.5 * WALKED / math.sqrt(duration)
-            L = joined([L, silent.expand(n_y, self.brownian), walk.to(L)], 2, -2)
+            L = joined([L, silent.expand(count, self.brownian), walk.to(L)], 2, -2)
         rate = scale * values[f"{self.name}_integrator_drift"]
-        still = torch.zeros(self.pairs), rate, torch.zeros((len(rates) - 1) * n_y)
+        still = torch.zeros(self.pairs), rate, torch.zeros((len(rates) - 1) * count)
         drift = joined([x.to(poles) for x in still], 1, -1)
         return poles, B, c, L, drift
 

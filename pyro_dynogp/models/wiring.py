@@ -71,6 +71,9 @@ class Wire:
             "direct": "input" if first else f"{self.name}_forward" if self.fed else own,
             "output": "output" if self.last and len(self.signals) == 1 else f"{self.name}_output",
         }
+        names["level"] = names["output"]  # of integrators, which hidden signals have not
+        if len(self.signals) > 1:
+            names["level"] = "output" if self.last else f"{self.name}_level"
         for dim in ("pair", "brownian", "state", "inducing", "support"):
             names[dim] = dim if self.single else f"{self.name}_{dim}"
         return names

@@ -265,41 +265,46 @@ def test_both_functions_together_are_fitted_where_one_of_them_helps_and_leaves_s
     assert tried.model == models[kept]
 
 
+# Variants of a nonlinear feedback in their order.
+VARIANTS = (
+    "feedback", "cube_of_output", "step_of_output", "root_of_output", "cube_of_hidden",
+    "step_of_hidden", "root_of_hidden", "hidden_feedback", "feedback_product", "hidden_product",
+    "step", "forms", "hidden_forms", "compartments", "hysteresis", "both",
+)  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    ("levels", "noise", "fitted"),
+    ("usual", "levels", "noise", "last"),
     [
-        ((5.0, 5.5, 9.0, 5.5, 7.0, 8.0, 6.0, 6.0, 6.0, 6.0, 6.0, 9.0), (), 12),
-        # Products, a step, forms, compartments and a hysteresis are tried whatever functions do.
-        ((-3.0, -3.0, 1.0, -3.0, -2.0, -3.0, -3.0, -3.0, -3.0, -3.0, -3.0, 9.0), (), 12),
+        (6.0, {"hidden_feedback": 9.0}, (), "both"),
+        # Forms, products, compartments and a hysteresis are tried whatever functions do.
+        (-3.0, {"hidden_feedback": 1.0}, (), "both"),
         # Both functions are not where nothing helps,
-        ((-3.0, -3.0, -1.0, -3.0, -2.0, -3.0, -3.0, -3.0, -3.0, -3.0, -3.0, 9.0), (), 11),
-        # nor where cubes lead, nor products, nor forms, nor compartments, nor a hysteresis,
-        ((-3.0, 3.0, 1.0, -3.0, -2.0, -3.0, -3.0, -3.0, -3.0, -3.0, -3.0, 9.0), (), 11),
-        ((-3.0, -3.0, 1.0, 3.0, -2.0, -3.0, -3.0, -3.0, -3.0, -3.0, -3.0, 9.0), (), 11),
-        ((-3.0, -3.0, 1.0, -3.0, -2.0, 3.0, -3.0, -3.0, -3.0, -3.0, -3.0, 9.0), (), 11),
-        ((-3.0, -3.0, 1.0, -3.0, -2.0, -3.0, -3.0, 3.0, -3.0, -3.0, -3.0, 9.0), (), 11),
-        ((-3.0, -3.0, 1.0, -3.0, -2.0, -3.0, -3.0, -3.0, -3.0, 3.0, -3.0, 9.0), (), 11),
-        ((-3.0, -3.0, 1.0, -3.0, -2.0, -3.0, -3.0, -3.0, -3.0, -3.0, 3.0, 9.0), (), 11),
+        (-3.0, {"hidden_feedback": -1.0}, (), "hysteresis"),
+        # nor where forms lead, nor products, nor compartments, nor a hysteresis,
+        *((-3.0, {"hidden_feedback": 1.0, name: 3.0}, (), "hysteresis") for name in (
+            "cube_of_output", "root_of_hidden", "hidden_product", "forms", "compartments",
+            "hysteresis")),
         # but where a step does.
-        ((-3.0, -3.0, 1.0, -3.0, -2.0, -3.0, 3.0, -3.0, -3.0, -3.0, -3.0, 9.0), (), 12),
-        # The rest is not beside noise alone: cubes, products, a step, forms, compartments,
-        ((5.0, 20.0, 9.0, 5.5, 7.0, 8.0, 6.0, 6.0, 6.0, 6.0, 6.0, 9.0), (20.0,), 2),
-        ((5.0, 5.5, 9.0, 5.5, 20.0, 8.0, 6.0, 6.0, 6.0, 6.0, 6.0, 9.0), (20.0,), 5),
-        ((5.0, 5.5, 9.0, 5.5, 7.0, 8.0, 20.0, 6.0, 6.0, 6.0, 6.0, 9.0), (20.0,), 7),
-        ((5.0, 5.5, 9.0, 5.5, 7.0, 8.0, 6.0, 20.0, 6.0, 6.0, 6.0, 9.0), (20.0,), 8),
-        ((5.0, 5.5, 9.0, 5.5, 7.0, 8.0, 6.0, 6.0, 20.0, 6.0, 6.0, 9.0), (20.0,), 9),
+        (-3.0, {"hidden_feedback": 1.0, "step": 3.0}, (), "both"),
+        # The rest is not beside noise alone: forms, products, a step, compartments,
+        *((6.0, {"hidden_feedback": 9.0, name: 20.0}, (20.0,), name) for name in (
+            "cube_of_output", "root_of_output", "step_of_hidden", "feedback_product", "step",
+            "forms", "hidden_forms", "compartments")),
         # unless another one forecasts better.
-        ((5.0, 5.5, 9.0, 5.5, 7.0, 8.0, 6.0, 6.0, 6.0, 6.0, 6.0, 9.0), (7.0,), 12),
-        ((5.0, 5.5, 9.0, 5.5, 7.0, 8.0, 6.0, 6.0, 6.0, 6.0, 6.0, 9.0), (9.0,), 3),
+        (6.0, {"hidden_feedback": 9.0, "hidden_product": 7.0}, (7.0,), "both"),
+        (6.0, {"hidden_feedback": 9.0}, (9.0,), "hidden_feedback"),
     ],
-)
+)  # fmt: skip
 def test_later_variants_are_fitted_one_by_one_while_something_is_left(
-    record, monkeypatch, levels, noise, fitted
+    record, monkeypatch, usual, levels, noise, last
 ):
     plain = dgp.LinearDynamicGP(1, pairs=2)
     said = SimpleNamespace(where={"output": "y", "products": 0.9})
     models = tuple(NonlinearFeedbackOfOutput().extend(plain, said, record))
-    assert len(models) == 12
+    assert len(models) == len(VARIANTS)
+    levels = [(levels | {"both": 9.0}).get(name, usual) for name in VARIANTS]
+    fitted = VARIANTS.index(last) + 1
     made = []
 
     def again(fit, training, *, model, run):

@@ -172,8 +172,10 @@ class TestDetection:
         assert 0.0 < nonlinear_feedback(r, SETTINGS).p_value <= 1.0
 
 
-# What comes first: functions and cubes of the output and of a hidden signal; products with both.
-FUNCTIONS = ["feedback", "feedback_cube", "hidden_feedback", "hidden_cube"]
+# What comes first: functions and simple forms of the output and of a hidden signal; products.
+OF_OUTPUT = ["cube_of_output", "step_of_output", "root_of_output"]
+OF_HIDDEN = ["cube_of_hidden", "step_of_hidden", "root_of_hidden"]
+FUNCTIONS = ["feedback", *OF_OUTPUT, *OF_HIDDEN, "hidden_feedback"]
 PRODUCTS = ["feedback_product", "hidden_product"]
 
 
@@ -182,14 +184,14 @@ class TestBlock:
         variants = EFFECT.extend(dgp.LinearDynamicGP(1, pairs=2), SAID, spring)
         wired = [{w.name: (w.sources, w.feedback) for w in model.wires} for model in variants]
         output, hidden = (("g",), ()), (("g_hidden",), ())
-        unseen, cube = ("hidden_feedback", "feedback_step"), ("feedback_cube",)
+        unseen = ("hidden_feedback", "feedback_step")
         forms = ("output_root", "output_edge", "output_step")
         more = (*forms[:2], "hidden_root", "hidden_edge", "hidden_step")
         assert wired == [
             {"g": (("inputs",), ("feedback",)), "feedback": output},
-            {"g": (("inputs",), cube), cube[0]: output},
+            *({"g": (("inputs",), (name,)), name: output} for name in OF_OUTPUT),
+            *({"g": (("inputs",), (name,)), name: hidden} for name in OF_HIDDEN),
             {"g": (("inputs",), unseen[:1]), unseen[0]: hidden},
-            {"g": (("inputs",), ("hidden_cube",)), "hidden_cube": hidden},
             {"g": (("inputs",), ("feedback_product",)),
              "feedback_product": (("inputs", "g"), ())},
             {"g": (("inputs",), ("hidden_product",)),
@@ -203,16 +205,17 @@ class TestBlock:
             {"g": (("inputs",), ("feedback", *unseen)), "feedback": output,
              **dict.fromkeys(unseen, hidden)},
         ]  # fmt: skip
-        for model in (*variants[:9], *variants[10:]):
+        for model in (*variants[:13], *variants[14:]):
             assert model.output_wire.name == "g"
             assert model.dynamic[0][1].pairs == 2
+        unseen = (
+            "A nonlinear function of a signal of the dynamics of 'x' that is not measured acts "
+            "back on them."
+        )
         said = [EFFECT.sentence(SAID, model) for model in variants]
         assert said == [
-            "What the test said.",
-            "What the test said.",
-            unseen := "A nonlinear function of a signal of the dynamics of 'x' that is not "
-            "measured acts back on them.",
-            unseen,
+            *("What the test said." for _ in range(4)),
+            *(unseen for _ in range(4)),
             "Inputs times 'x' act back on its dynamics.",
             "Inputs times a signal of the dynamics of 'x' that is not measured act back on its "
             "dynamics.",
@@ -254,25 +257,26 @@ class TestBlock:
         own = {"feedback_1": ("g[0]",), "feedback_2": ("g[1]",)}
         hidden = {"hidden_feedback_1": ("g_hidden[0]",), "hidden_feedback_2": ("g_hidden[1]",)}
         steps = {"feedback_step_1": ("g_hidden[0]",), "feedback_step_2": ("g_hidden[1]",)}
-        cube = {f"feedback_cube_{k + 1}": own[f"feedback_{k + 1}"] for k in range(2)}
-        cubed = {f"hidden_cube_{k + 1}": (f"g_hidden[{k}]",) for k in range(2)}
-        assert wired[:4] == [own, cube, hidden, cubed]
-        assert wired[6:8] == [hidden | steps, {"joint_feedback": ("g",)}]
-        assert [len(one) for one in wired[8:]] == [
+        cubes = {f"cube_of_output_{k + 1}": own[f"feedback_{k + 1}"] for k in range(2)}
+        cubed = {f"cube_of_hidden_{k + 1}": (f"g_hidden[{k}]",) for k in range(2)}
+        assert (wired[0], wired[1], wired[4], wired[7]) == (own, cubes, cubed, hidden)
+        assert wired[10:12] == [hidden | steps, {"joint_feedback": ("g",)}]
+        assert [len(one) for one in wired[12:]] == [
             6,
             10,
             6,
         ]  # forms, and all smooth ones with steps
         assert wired[-1] == own | hidden | steps
-        assert made[2].dynamic[0][1].hidden == 2
-        assert made[7].wires[1].layer.outputs == 2
+        assert made[7].dynamic[0][1].hidden == 2
+        assert made[11].wires[1].layer.outputs == 2
         again = EFFECT.extend(made[0], SAID, spring)
         added = [{w.name for w in one.wires} - {"g", *own} for one in again]
-        assert added == [set(hidden), set(cubed), {"feedback_product"}, {"hidden_product"}]
-        assert len(EFFECT.extend(made[7], SAID, spring)) == 4  # none of what the joint one sees
+        assert added[0] == set(cubed)
+        assert added[3:] == [set(hidden), {"feedback_product"}, {"hidden_product"}]
+        assert len(EFFECT.extend(made[11], SAID, spring)) == 6  # none of what the joint one sees
         test = "What the test said."
         unseen = "signals of the dynamics that are not measured"
-        assert [EFFECT.sentence(SAID, one) for one in (made[0], made[2], made[7], made[-1])] == [
+        assert [EFFECT.sentence(SAID, one) for one in (made[0], made[7], made[11], made[-1])] == [
             f"{test} The model has a function of each output.",
             f"Nonlinear functions of {unseen} act back on them.",
             test,
@@ -288,16 +292,15 @@ class TestBlock:
     def test_what_is_there_is_not_added_again(self, spring):
         """To a function of the output one of a hidden signal, and the other way round."""
         made = EFFECT.extend(dgp.LinearDynamicGP(1), SAID, spring)
-        first, cube, second, cubed, product, hidden, _, forms, more, chain, past, both = made
+        first, cube, _, _, cubed, _, _, second, product, hidden, _, forms, more, chain, *rest = made
+        past, both = rest
         for model, one, other in (
-            (cube, "feedback_cube", "hidden_feedback"), (cubed, "hidden_cube", "feedback")
+            (cube, "cube_of_output", "hidden_feedback"), (cubed, "cube_of_hidden", "feedback")
         ):  # fmt: skip
             # A function of what the cube sees is none that is new.
-            added = [
-                set(x.dynamic[0][0].feedback) - {one} for x in EFFECT.extend(model, SAID, spring)
-            ]
-            assert added[0] == {other}
-            assert not any({"feedback", "hidden_feedback"} <= names for names in added)
+            extended = [set(x.dynamic[0][0].feedback) for x in EFFECT.extend(model, SAID, spring)]
+            assert {one, other} in extended
+            assert not any({"feedback", "hidden_feedback"} <= names for names in extended)
         back = {"feedback", "hidden_feedback", "feedback_step"}
         products = [{"feedback_product"}, {"hidden_product"}]
         of_output = {"output_root", "output_edge", "output_step"}
@@ -306,19 +309,20 @@ class TestBlock:
             own = set(model.dynamic[0][0].feedback)
             extended = EFFECT.extend(model, SAID, spring)
             made = [set(one.dynamic[0][0].feedback) for one in extended]
-            cubes = {"hidden_cube"} if model is first else {"feedback_cube"}
-            assert made[:4] == [
-                back - {"feedback_step"}, own | cubes, own | products[0],
-                own | products[1],
-            ]  # fmt: skip
+            simple = OF_HIDDEN if model is first else OF_OUTPUT
+            *leading, function, product_, hidden_product = made[:6]
+            assert sorted(map(sorted, (*leading, function))) == sorted(
+                sorted(one) for one in (back - {"feedback_step"}, *(own | {x} for x in simple))
+            )
+            assert [product_, hidden_product] == [own | products[0], own | products[1]]
             assert (back in made) == (model is first)
             assert own | others in made
-            assert extended[0].dynamic[0][1].hidden == 1
+            assert extended[1].dynamic[0][1].hidden == 1
         made = [set(one.dynamic[0][0].feedback) for one in EFFECT.extend(forms, SAID, spring)]
         assert of_output | of_hidden in made
         for model in (more, both):
             assert len(EFFECT.extend(model, SAID, spring)) == 2  # products
-        assert len(EFFECT.extend(product, SAID, spring)) == 10
+        assert len(EFFECT.extend(product, SAID, spring)) == 14
         added = [one.dynamic[0][0].feedback for one in EFFECT.extend(past, SAID, spring)]
         assert ("feedback_hysteresis", "feedback") in added
         assert all(one.count("feedback_hysteresis") == 1 and len(one) > 1 for one in added)
@@ -329,8 +333,11 @@ class TestBlock:
             )
         for model in (product, hidden):
             assert model not in EFFECT.extend(model, SAID, spring)
-        own, *_ = EFFECT.extend(dgp.NonlinearFeedback(1), SAID, spring)
-        assert own.dynamic[0][0].feedback == ("f", "hidden_feedback")
+        own = [
+            one.dynamic[0][0].feedback
+            for one in EFFECT.extend(dgp.NonlinearFeedback(1), SAID, spring)
+        ]
+        assert own[:4] == [*(("f", name) for name in OF_HIDDEN), ("f", "hidden_feedback")]
         more = EFFECT.extend(dgp.NonlinearFeedback(1, hidden=2), SAID, spring)
         assert [set(one.dynamic[0][0].feedback[2:]) for one in more] == products
 

@@ -285,3 +285,29 @@ def test_feedback_from_a_position():
     (gradient,) = torch.autograd.grad(density, value)
     assert value.shape == (1, 2)
     assert bool(torch.isfinite(gradient).all() and (gradient != 0).all())
+
+
+@pytest.mark.parametrize(("process_noise", "outputs"), [(True, 1), (False, 1), (True, 2)])
+def test_hidden_signals_do_not_see_integrators(process_noise, outputs):
+    """Where an output integrates nothing depends on its level: levels are of outputs alone."""
+    layer = dgp.Dynamic(
+        outputs=outputs, pairs=2, integrators=1, hidden=1, feedback=("f",),
+        process_noise=process_noise,
+    )  # fmt: skip
+    function = dgp.Static(inducing=4, sees=("g_hidden",), name="f")
+    model = dgp.Cascade(1, (layer, function), output="g")
+    model, along, values = prepared(model, some_record(outputs=outputs))
+    shapes = {k: tuple(v.shape) for k, v in values.items()}
+    assert shapes["g_integrator_gain"] == (outputs, 2)  # of the input, and of what comes back
+    assert shapes["g_integrator_drift"] == (outputs,)
+    assert shapes.get("g_integrator_noise") == ((outputs, outputs) if process_noise else None)
+    modes = model.system(values, along.scaling).layer("g").modes
+    at_zero = modes.poles == 0.0
+    assert int(at_zero.sum()) == outputs
+    own = modes.C[:, at_zero]
+    np.testing.assert_array_equal(own[:outputs], np.eye(outputs))
+    assert not own[outputs:].any()
+    labels = {site.name: site.dims for site in model.sites(along.scaling)}
+    assert labels["g_integrator_gain"] == ("output", "g_input")
+    outputs_ = MomentOutputs(model.begin(model.system(values, along.scaling), {}), along)
+    assert np.isfinite(float(outputs_.log_prob(along.observations)))

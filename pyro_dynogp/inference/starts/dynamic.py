@@ -149,7 +149,8 @@ class DynamicStart:
             found[self._key("feedthrough")] = torch.cat([D.reshape(known, -1), more])
         for site in map(self._key, INTEGRATORS):
             if site in values:
-                found[site] = torch.cat([values[site], self._random(rest, *values[site].shape[1:])])
+                more = self._random(layer.levels - known, *values[site].shape[1:])
+                found[site] = torch.cat([values[site], more])
         return found
 
     def _hidden(self, values: Values, measured: Tensor, ahead: bool) -> Tensor:
@@ -265,7 +266,7 @@ class DynamicStart:
     def _small_noise(self) -> Values:
         layer = self.layer
         count = layer.brownian or layer.outputs
-        walk = {self._key("integrator_noise"): torch.full((layer.width, count), WALKS).double()}
+        walk = {self._key("integrator_noise"): torch.full((layer.levels, count), WALKS).double()}
         return {
             **(walk if layer.integrators else {}),
             self._key("noise_gain_local_scale"): torch.full((layer.pairs,), 0.5).double(),

@@ -205,9 +205,7 @@ def _linear_state(
     """Standard normal numbers of the first state that the linear fit finds by smoothing."""
     layer = one.layer
     assert isinstance(layer, Dynamic)
-    # States that the linear fit has not.
-    other = layer.real or (layer.hidden and layer.integrators)
-    if layer.outputs != model.outputs or not one.channels or other:
+    if layer.outputs != model.outputs or not one.channels or layer.real:
         return torch.zeros(len(layer.past_states), dtype=torch.float64)
     noisy = "g_noise_gain_unit" in linear
     own = replace(layer, feedback=(), hidden=0, substeps=1, process_noise=noisy)
