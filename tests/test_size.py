@@ -40,9 +40,10 @@ LINES = 31_500
 # resolve (70 lines), and parametric forms in feedback (160 lines), and compartments (280 lines, of
 # which tests are 200), and means of levels over steps, and products of inputs beside those of the
 # output (240 lines), and a hysteresis in feedback and bands of parameters that stay at their
-# optimum (390 lines).
+# optimum (390 lines), and layers that see single channels, and single forms in feedback (210
+# lines).
 # To shrink.
-LINES_TODAY = 55_200
+LINES_TODAY = 55_400
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()
