@@ -15,6 +15,7 @@ from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.lti.grid import TimeGrid
 from pyro_dynogp.lti.modes import Modes
 from pyro_dynogp.lti.response import mean_response
+from pyro_dynogp.lti.roots import root_of
 from pyro_dynogp.lti.state import ModalState
 from pyro_dynogp.models.known import KnownFunction
 from pyro_dynogp.models.system import DynamicSystem, StaticSystem, System, see
@@ -76,12 +77,6 @@ class JointState:
     def drawn(self, standard: Tensor) -> Tensor:
         """States (*s, N) that standard normal numbers (*s, N) make."""
         return self.mean + (self.root() @ standard.unsqueeze(-1)).squeeze(-1)
-
-
-def root_of(covariance: Tensor) -> Tensor:
-    """Square root (*b, N, N) of a covariance, singular or not."""
-    values, vectors = torch.linalg.eigh(covariance)
-    return vectors * values.clamp_min(0.0).sqrt().unsqueeze(-2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ from torch import Tensor
 from pyro_dynogp.layers.functions import support_points
 from pyro_dynogp.lti.grid import TimeGrid
 from pyro_dynogp.lti.primitives import array, flatten_batch
+from pyro_dynogp.lti.roots import root_of
 from pyro_dynogp.models.assembly import Assembly, assemble
 from pyro_dynogp.models.draws import (
     Drawn,
@@ -19,7 +20,6 @@ from pyro_dynogp.models.draws import (
     Switches,
     draw_layers,
     draw_static,
-    root_of,
 )
 from pyro_dynogp.models.filter_functions import Block, functions_of
 from pyro_dynogp.models.known import KnownFunction

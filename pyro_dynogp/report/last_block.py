@@ -10,7 +10,6 @@ import numpy as np
 
 from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.discrepancy.context import SearchContext
 from pyro_dynogp.discrepancy.decision import Confirmed
 from pyro_dynogp.discrepancy.held_out import one_step_density
 from pyro_dynogp.discrepancy.parameters import parameters_of
@@ -22,10 +21,9 @@ from pyro_dynogp.models.description import describe, in_words
 from pyro_dynogp.prediction.records import joined
 from pyro_dynogp.prediction.scores import scores
 from pyro_dynogp.report.last_block_bands import said_of_bands
+from pyro_dynogp.report.last_tests import last_tests
 from pyro_dynogp.report.report import Report
-from pyro_dynogp.statistics.evidence import Residuals
 from pyro_dynogp.statistics.settings import LoopSettings
-from pyro_dynogp.support.parallel import parallel_map
 
 if TYPE_CHECKING:
     from pyro_dynogp.fitting import Fit
@@ -74,7 +72,7 @@ def report_of(fits: Sequence[Fit], course: SearchState, warnings: Sequence[str])
         names = [found.effect.name for found, _ in accepted[kept:]]
         said = [compared(count, kept).left_out(names) if kept else change.harm, *said]
     watch.stop("scores of the last block")
-    tests = _tested([f for f, _ in accepted], (base, extended), whole, sealed, rounds)
+    tests = last_tests([f for f, _ in accepted], (base, extended), whole, sealed, rounds)
     watch.stop("residual tests of the last block")
     effects = [
         replace(
@@ -251,32 +249,6 @@ def _outcome(course: SearchState, left: Sequence[str], *, harm: bool) -> str:
     if course.accepted:
         return "effects added, structure left" if left else "effects added"
     return "structure left, cause unknown" if left else "nothing missing"
-
-
-def _tested(
-    found: Sequence[Found],
-    fits: Sequence[Fit],
-    whole: Record,
-    sealed: np.ndarray,
-    rounds: SearchContext,
-) -> dict[str, tuple[float, float]]:
-    """Smallest p-value of each effect's tests on C, of the model before and after."""
-    effects = list({f.effect.name: f.effect for f in found}.values())
-    if not effects:
-        return {}
-    residuals = [rounds.residuals(one, whole, sealed) for one in fits]
-
-    def smallest(task: tuple[Effect, list[Residuals]]) -> float:
-        effect, parts = task
-        found = [effect.detect(part, rounds.settings, seed=rounds.seed) for part in parts]
-        # There may be nothing left to test.
-        return min((one.p_value for several in found for one in several), default=1.0)
-
-    tasks = [(effect, parts) for effect in effects for parts in residuals]
-    p = parallel_map(
-        smallest, tasks, workers=rounds.workers, progress=rounds.progress, description="last tests"
-    )
-    return {effect.name: (p[2 * k], p[2 * k + 1]) for k, effect in enumerate(effects)}
 
 
 def _effect(
