@@ -22,7 +22,7 @@ def test_the_effect_is_named_with_the_signal_that_it_acts_on(report):
     assert found.name == "nonlinear feedback"
     assert found.sentence.startswith("A nonlinear function of a signal of the dynamics of 'y'")
     (wire, layer), *_ = report.fit.model.dynamic
-    assert (wire.feedback, layer.hidden) == (("hidden_feedback", "feedback_step"), 1)
+    assert (wire.feedback, layer.hidden) == (("step_of_hidden",), 1)  # Coulomb's
 
 
 def test_errors_fall_to_a_fraction(report):

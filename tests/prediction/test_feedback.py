@@ -225,7 +225,7 @@ def test_same_bits_with_one_and_two_workers():
             lambda: dgp.Cascade(
                 1, (dgp.Dynamic(hidden=1, feedback=("f",)), dgp.Static()), output="g"
             ),
-            "a function that sees 'g_hidden'",
+            "functions that see all of 'g_hidden'",
         ),
         (
             lambda: dgp.Cascade(1, (dgp.Dynamic(hidden=1), dgp.Static(sees=("g_hidden",)))),
