@@ -15,7 +15,7 @@ from pyro_dynogp.discrepancy.held_out_errors import one_step_errors
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
 from pyro_dynogp.models.delays import longest_delay, unknown_beginning
 from pyro_dynogp.models.limits import at_limits
-from pyro_dynogp.prediction.predict import runs_after
+from pyro_dynogp.prediction.predict import holds_after, runs_after
 from pyro_dynogp.statistics.evidence import Residuals
 from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.support.errors import invalid
@@ -153,7 +153,8 @@ def _free_run(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean (n, n_y) of a free run from sample `begin` on, and draws of it (S, n, n_y).
 
-    Before, and along all of a record without outputs there, from an unknown first state.
+    Before, and along all of a record without outputs there, from an unknown first state; so where
+    predictions before run away.
     """
     noisy = fit.model.is_linear
     mean = fit.simulate(record, process_noise=noisy, seed=seed).mean
@@ -164,7 +165,8 @@ def _free_run(
         past, rest = record[:begin], record[begin:]
         runs = _runs(spread, past, rest, count, seed)
         few = min(len(component), len(runs))
-        if few:
+        holds = not fit.model.has_feedback or bool(holds_after(fit, past, rest).all())
+        if few and holds:
             mean[begin:] = fit.forecast(past, rest, process_noise=noisy, seed=seed).mean
             component = np.concatenate([component[:few, :begin], runs[:few]], axis=1)
     return mean, component
@@ -173,8 +175,15 @@ def _free_run(
 def _runs(spread: Fit, past: Record, rest: Record, count: int, seed: int) -> np.ndarray:
     """Draws of a free run (S, n, n_y), of those parameter draws at which the filter can be run.
 
-    A draw may have a first state so uncertain that nothing of the noise is left of its variance.
+    A draw may have a first state so uncertain that nothing of the noise is left of its variance, or
+    run away with what comes back.
     """
+    if spread.model.has_feedback:
+        holding = holds_after(spread, past, rest)
+        if not bool(holding.any()):
+            return np.empty((0, len(rest), rest.n_outputs))
+        if not bool(holding.all()):
+            spread = spread.with_draws({name: x[holding] for name, x in spread.draws.items()})
     try:
         return runs_after(spread, past, rest, samples=count, seed=seed)
     except NotPositiveDefiniteError:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.models.draws import JointState, first_state, variance_multiples
@@ -81,6 +82,18 @@ def _after(
     next_inputs = arrive(fit.system, later).inputs[..., 0, :]
     y = earlier.observations
     return before, before.state_after(y, gap, next_inputs, process_noise=process_noise)
+
+
+def holds_after(fit: Fitted, past: Record, future: Record) -> Tensor:
+    """Which draws (S,) of parameters have a state after a past that is finite.
+
+    Functions in feedback may make predictions run away before.
+    """
+    earlier, later, gap = following(fit, past, future)
+    with torch.no_grad():
+        _, given = _after(fit, earlier, later, gap, process_noise=False)
+    finite = torch.isfinite(given.mean).all(-1) & torch.isfinite(given.covariance).all(-1).all(-1)
+    return finite.expand(fit.n_draws)
 
 
 def runs_after(

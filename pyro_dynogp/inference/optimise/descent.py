@@ -94,11 +94,12 @@ def newton(
             strict=True,
         )
         for i, value, g in each:
-            finite = np.isfinite(value) and np.isfinite(g).all()
+            with np.errstate(all="ignore"):
+                H = (g[1:] - g[0]) / STEP
+            finite = np.isfinite(value) and np.isfinite(g).all() and np.isfinite(H).all()
             if not (finite and value < best[i]):
                 length[i] *= 0.25
                 continue
-            H = (g[1:] - g[0]) / STEP
             curvature, axes = np.linalg.eigh(0.5 * (H + H.T))
             along = (g[0] @ axes) / np.maximum(np.abs(curvature), FOLLOWED**-2)
             z[i], best[i], length[i] = tried[i], value, 1.0
