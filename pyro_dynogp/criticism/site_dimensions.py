@@ -62,11 +62,8 @@ def labels_of(model: Model, scaling: Scaling, records: Sequence[Record]) -> dict
             dim, own = wire.dims["output"], [signals[name] for name in wire.signals]
             labels[dim] = (dim, np.array([label for names in own for label in names]), {})
     for wire in model.wires:
-        seen = tuple(
-            label
-            for source in wire.sources
-            for label in signals[signal_of(source)][part(source, len(signals[signal_of(source)]))]
-        )
+        sources = [(source, signals[signal_of(source)]) for source in wire.sources]
+        seen = tuple(label for one, names in sources for label in names[part(one, len(names))])
         fed = tuple(label for source in wire.feedback for label in signals[source])
         for role, names in (("direct", seen), ("input", seen + fed)):
             dim = wire.dims[role]

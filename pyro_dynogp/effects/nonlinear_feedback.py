@@ -199,8 +199,8 @@ class NonlinearFeedbackOfOutput(Effect):
         Products come first where the test has one as its best column, and are left out where none
         gains nearly as much: refits take as long as those of functions. A step beside a smooth
         function may hold it at a poor optimum, of 70 nats less in one spring between two masses.
-        Beside functions of several outputs that act back already there are no steps and forms: they
-        were tried together with these, and take minutes.
+        Beside functions of several outputs that act back already there are no steps of hidden
+        signals and no forms together: they were tried together with these, and take minutes.
         """
         share = float(evidence.where["products"])
         alone, stepped = (

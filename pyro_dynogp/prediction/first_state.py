@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -60,7 +61,9 @@ def training_index(fit: Fitted, record: PreparedRecord) -> int | None:
 def estimate(fit: Fitted, record: PreparedRecord) -> dict[str, Tensor]:
     """Most probable first state of a record, as standard normal numbers (2P,) by layer.
 
-    Of layers that a static layer sees.
+    Of layers that a static layer sees. One start is zero, two are random, others are what the fit
+    has learnt of its training records: a record may begin as one of them does, and functions in
+    feedback may run away from other states.
     """
     model = fit.model
     head = PreparedRecord.of(record.record[:SAMPLES], record.scaling)
@@ -83,6 +86,19 @@ def estimate(fit: Fitted, record: PreparedRecord) -> dict[str, Tensor]:
         return value.detach().numpy(), gradient.numpy()
 
     generator = np.random.default_rng(0)
-    starts = np.concatenate([np.zeros((1, total)), 0.5 * generator.standard_normal((2, total))])
+    starts = np.concatenate([
+        np.zeros((1, total)), 0.5 * generator.standard_normal((2, total)), _learnt(fit, sizes)
+    ])  # fmt: skip
     found, values = newton(energies, starts)
     return split(torch.tensor(found[values.argmin()]))
+
+
+def _learnt(fit: Fitted, sizes: Mapping[str, int]) -> np.ndarray:
+    """First states (k, N) of the training records, of layers of so many numbers each."""
+    count = len(fit.records) if fit.model.state_sites else 0
+    found = []
+    for index in range(count):
+        states = fit.model.states_of(fit.mode, "" if count == 1 else f"_{index}")
+        if all(name in states for name in sizes):
+            found.append(np.concatenate([states[name].detach().numpy() for name in sizes]))
+    return np.array(found).reshape(-1, sum(sizes.values()))

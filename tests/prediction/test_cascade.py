@@ -1,6 +1,7 @@
 """Predictions of cascades: where all is linear, against the exact ones; else against simulation."""
 
 from contextlib import nullcontext
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,7 +16,9 @@ import pyro_dynogp as dgp
 from pyro_dynogp.distributions.process import ConditionedLTIProcess
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.prepared import PreparedRecord
+from pyro_dynogp.prediction import first_state
 from pyro_dynogp.prediction.first_state import estimate
+from pyro_dynogp.support.frozen import FrozenMapping
 from tests.models.outputs import by_moments, physical_of, prior_process
 from tests.prediction.known import (
     fit_of,
@@ -390,6 +393,26 @@ class TestBeginning:
         error = (record.outputs - fit.predict(record).mean)[:5]
         assert np.abs(error).max() < 0.3
         assert np.isfinite(fit.log_likelihood(record)).all()
+
+    def test_what_is_learnt_of_training_records_is_a_start(self, monkeypatch):
+        """A record may begin as a training record does."""
+        fit = wiener_fit(noise_sd=0.02, drift=0.05)
+        known = torch.tensor([0.7, -0.4], dtype=torch.float64)
+        record, _ = wiener_data(fit, n=60)
+        mode = FrozenMapping(dict(fit.mode) | {"g_initial_state": known})
+        fit = replace(fit, mode=mode, records=(record,))
+        assert [wire.name for wire in fit.model.state_sites] == ["g"]
+        began = []
+
+        def newton(functions, starts):
+            began.extend(starts.tolist())
+            return starts, np.arange(len(starts), dtype=float)[::-1]
+
+        monkeypatch.setattr(first_state, "newton", newton)
+        z = estimate(fit, PreparedRecord.of(record, fit.scaling))["g"]
+        assert len(began) == 4
+        assert began[0] == [0.0, 0.0]
+        torch.testing.assert_close(z, known)  # the last one, which is the best
 
     def test_it_is_the_most_probable_one(self):
         """To what a general optimiser with a tolerance of rounding finds."""

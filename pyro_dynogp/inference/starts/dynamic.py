@@ -135,7 +135,8 @@ class DynamicStart:
         gain = torch.cat([own, self._random(layer.width, P, 2, scale=OTHERS)[known:]])
         if layer.hidden:
             # As many as outputs go by these, in their order.
-            places = range(known) if layer.hidden == known else self._signals[:known]
+            alike = known in (1, layer.hidden)
+            places = range(known) if alike else self._signals[:known]
             measured = torch.stack([own[place] for place in places[: layer.hidden]])
             gain[-layer.hidden :] = self._hidden(values, measured, ahead)
         length = gain.square().sum((0, -1)).sqrt()  # directions have unit length
