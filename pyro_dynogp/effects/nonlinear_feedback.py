@@ -23,11 +23,13 @@ from pyro_dynogp.models.feedback_variants import (
     with_hysteresis,
     with_joint_feedback,
     with_products,
+    with_products_of_states,
 )
 from pyro_dynogp.models.forms import FormName, hysteresis
 from pyro_dynogp.models.product import is_product
 from pyro_dynogp.models.system import DynamicSystem
 from pyro_dynogp.models.variants import Model
+from pyro_dynogp.models.wiring import INPUTS
 from pyro_dynogp.statistics.bootstrap import Scan
 from pyro_dynogp.statistics.detecting import lasting
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
@@ -176,8 +178,8 @@ class NonlinearFeedbackOfOutput(Effect):
     level of another tank), or one of each, of several outputs one function for each and one of all
     together; a cube, a step or a root of either, which are fitted in seconds and hold beyond the
     data; roots, edges and steps of both; products of the inputs with the output, and with each
-    other, or with such a signal; two compartments in place of linear dynamics; a hysteresis of two
-    such signals. A later one only where it is certainly better.
+    other, or with such a signal; two compartments in place of linear dynamics; products of three
+    such signals; a hysteresis of two. A later one only where it is certainly better.
     """
 
     name = "nonlinear feedback"
@@ -219,7 +221,10 @@ class NonlinearFeedbackOfOutput(Effect):
         forms = [with_forms(model), with_forms(model, hidden=True)]
         chain = in_place_of(model, CHAIN)
         past, both = with_hysteresis(model), with_feedback(model, hidden=True)
-        extended = [*leading, stepped, with_joint_feedback(model), *forms, chain, past, both]
+        states = with_products_of_states(model)
+        extended = [
+            *leading, stepped, with_joint_feedback(model), *forms, chain, states, past, both
+        ]  # fmt: skip
         if model.has_feedback and model.outputs > 1:
             extended = leading
         return list({repr(variant): variant for variant in extended if variant}.values())
@@ -248,8 +253,10 @@ class NonlinearFeedbackOfOutput(Effect):
         if model.outputs > 1 or len(fed) != 1 or not fed[0].last:
             return {}
         names = fed[0].feedback
-        if any(is_product(w.layer) for w in model.wires if w.name in names):
-            return dominant_rates(fit, fed[0], record) if len(names) == 1 else {}
+        multiplied = [w for w in model.wires if w.name in names and is_product(w.layer)]
+        if multiplied:
+            inputs = len(names) == 1 and multiplied[0].sources[0] == INPUTS
+            return dominant_rates(fit, fed[0], record) if inputs else {}
         if len(fed[0].signals) > 1:  # what they see is hidden
             return {}
         system = fit.system_at(fit.draws)

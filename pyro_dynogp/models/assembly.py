@@ -271,6 +271,7 @@ class _Assembler:
                 forms,
                 share,
                 multiple,
+                linear=[b.is_linear for b in blocks],
                 measured=self.function_is_measured(output),
             ),
             re=joined.real,

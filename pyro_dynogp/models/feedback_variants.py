@@ -14,11 +14,11 @@ from pyro_dynogp.models.variants import with_dynamics
 from pyro_dynogp.models.wiring import HIDDEN, INPUTS, Dynamic, Known, Layer, Static, Wire
 
 # Names of functions that act back: of a layer's outputs, of signals of it that are hidden, steps of
-# the latter, of all outputs together, a hysteresis of two hidden signals, and products of
-# inputs with the output or with a hidden signal.
+# the latter, of all outputs together, a hysteresis of two hidden signals, products of three, and
+# products of inputs with the output or with a hidden signal.
 FEEDBACK, HIDDEN_FEEDBACK, STEP = "feedback", "hidden_feedback", "feedback_step"
 JOINT_FEEDBACK = "joint_feedback"
-HYSTERESIS = "feedback_hysteresis"
+HYSTERESIS, STATE_PRODUCTS = "feedback_hysteresis", "feedback_products"
 PRODUCT, HIDDEN_PRODUCT = "feedback_product", "hidden_product"
 
 
@@ -109,15 +109,18 @@ def with_hysteresis(model: Model) -> Model | None:
     None for less than two pairs of poles, which have no state for it, for several outputs or a
     hidden signal that there is, and where `with_feedback` is None.
     """
-    if not model.dynamic:
-        return None
-    seen, layer = model.dynamic[-1]
-    if layer.pairs < 2 or layer.outputs > 1 or layer.hidden:
-        return None
-    extended = _fed_back(
-        model, [Form("hysteresis", sees=(seen.name + HIDDEN,), name=HYSTERESIS)], hidden=2
-    )
-    return None if extended is None else with_usual_substeps(extended)
+    seen = _hidden_name(model)
+    return _of_several(model, Form("hysteresis", sees=(seen,), name=HYSTERESIS), 2)
+
+
+def with_products_of_states(model: Model) -> Model | None:
+    """The model with products of one signal of its dynamics with two others that act back on them.
+
+    Nothing measures the three. Predator and prey, a current with itself and with a speed. None
+    where `with_hysteresis` is None.
+    """
+    seen = _hidden_name(model)
+    return _of_several(model, Product(1, 2, sees=(seen,), name=STATE_PRODUCTS), 3)
 
 
 def with_products(model: Model, *, hidden: bool = False) -> Model | None:
@@ -146,6 +149,22 @@ def with_products(model: Model, *, hidden: bool = False) -> Model | None:
 def noise_allows_feedback(model: Model) -> bool:
     """Whether functions may be put in feedback beside the model's measurement noise."""
     return model.likelihood.gaussian and not model.likelihood.follows_output
+
+
+def _hidden_name(model: Model) -> str:
+    """Name of the hidden signals of the last dynamic layer."""
+    return f"{model.dynamic[-1][0].name if model.dynamic else ''}{HIDDEN}"
+
+
+def _of_several(model: Model, given: Known, hidden: int) -> Model | None:
+    """The model with a function of so many hidden signals, see `with_hysteresis`."""
+    if not model.dynamic:
+        return None
+    _, layer = model.dynamic[-1]
+    if layer.pairs < 2 or layer.outputs > 1 or layer.hidden:
+        return None
+    extended = _fed_back(model, [given], hidden=hidden)
+    return None if extended is None else with_usual_substeps(extended)
 
 
 def _hidden(layer: Dynamic) -> int:

@@ -48,6 +48,14 @@ class Block:
         return self.channels if self.function is None else self.function.outputs
 
     @property
+    def is_linear(self) -> bool:
+        """Whether it is linear in what is random: products whose first signals are known."""
+        function = self.function
+        if not (isinstance(function, KnownFunction) and isinstance(function.function, Products)):
+            return False
+        return not bool((self.rows[..., : function.function.first, :] != 0.0).any())
+
+    @property
     def order(self) -> Sequence[int]:
         """Places of its inputs as the filter has them: quadrature goes channel by channel."""
         order = self.function.order if isinstance(self.function, StaticFunction) else None
@@ -116,7 +124,6 @@ def _function(block: Block, M: int, widest: int) -> tuple[int, dict[str, Tensor]
         values["slope"] = torch.eye(d, widest, dtype=torch.float64)
         return KERNELS["rbf"], values
     if isinstance(function, KnownFunction) and isinstance(function.function, Products):
-        _check_known_first(block, function.name, function.function.first)
         return PRODUCT + function.function.first, values | _shifted(function, widest)
     if isinstance(function, KnownFunction) and function.function is hysteresis:
         return HYSTERESIS, values | _hysteretic(function, M, widest)
@@ -168,17 +175,6 @@ def _function(block: Block, M: int, widest: int) -> tuple[int, dict[str, Tensor]
     if function.slope is not None:
         values["slope"] = pad(function.slope[..., order], (0, widest - d))
     return KERNELS[name], values
-
-
-def _check_known_first(block: Block, name: str, first: int) -> None:
-    """Refuse products of two signals that are random: moments of these are not exact."""
-    if bool((block.rows[..., :first, :] != 0.0).any()):
-        raise invalid(
-            f"layer {name!r}",
-            expected=f"inputs, or functions of inputs alone, as its first {first} signals",
-            got="signals of dynamics",
-            advice="A function of two signals of dynamics is a Static layer.",
-        )
 
 
 def _shifted(function: KnownFunction, widest: int) -> dict[str, Tensor]:

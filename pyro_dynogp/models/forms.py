@@ -18,6 +18,7 @@ from torch.nn.functional import softplus
 from pyro_dynogp.data.channels import Channel
 from pyro_dynogp.models.arrival import free_delays
 from pyro_dynogp.models.layer import HIDDEN, Dynamic, Known, Layer
+from pyro_dynogp.models.product import is_product
 from pyro_dynogp.models.selection import each_channel
 from pyro_dynogp.support.errors import invalid
 from pyro_dynogp.support.frozen import FrozenMapping
@@ -210,8 +211,12 @@ def form_of(layer: Layer) -> FormName | None:
 def have_no_place(layers: Sequence[Layer]) -> bool:
     """Whether functions have no place, beside signals of dynamics that nothing measures.
 
-    Smooth functions and a hysteresis have none; a step, a root and an edge lie somewhere.
+    Smooth functions, a hysteresis and products of such signals have none; a step, a root and an
+    edge lie somewhere.
     """
     hidden = any(isinstance(layer, Dynamic) and layer.hidden for layer in layers)
     known = [layer for layer in layers if isinstance(layer, Known)]
-    return hidden and all(layer.function is hysteresis for layer in known)
+    return hidden and all(
+        layer.function is hysteresis or (is_product(layer) and layer.sees[0].endswith(HIDDEN))
+        for layer in known
+    )

@@ -40,7 +40,9 @@ def Product(
 
     f(u, y)_{ij} = u_i y_j. In feedback of inputs and an output it makes a bilinear system,
     x' = A x + B u + sum_ij F_ij u_i y_j: what flows takes heat with it, a brake slows what moves.
-    Given the inputs such a system is linear, and the filter exact.
+    Given the inputs such a system is linear, and the filter exact. Products of signals of dynamics
+    are what two species or two reagents, a flux and a current, or two rates of rotation make;
+    their mean and variance are exact for up to four signals, and they grow beyond the data.
 
     Sites: none. The gains of the layer that sees it are the sizes of the products. Inputs and the
     output are seen as standard deviations from their mean, signals of dynamics as they are.
@@ -48,8 +50,7 @@ def Product(
     Source: Mohler, Bilinear Control Processes, 1973, chapter 1.
 
     Args:
-        first: number of signals that come first: inputs, or functions of inputs alone, where the
-            others are integrated out. others: of those that follow.
+        first: number of signals that come first, inputs for example. others: of those that follow.
         skip: names of earlier signals that the layer sees too. sees: those that it sees instead.
         name: prefix of its signals; f, or f1, f2, ... by default.
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from pyro_dynogp.lti.primitives import array, flatten_batch
 from pyro_dynogp.lti.primitives import run as run_recursion
 from pyro_dynogp.moments import filtering, reverse
-from pyro_dynogp.moments.functions import PRODUCT, TABLE, cubature, gauss_hermite
+from pyro_dynogp.moments.functions import TABLE, cubature, gauss_hermite
 from pyro_dynogp.moments.layout import Layout, Values, zero_bars
 from pyro_dynogp.support.tensors import broadcast
 
@@ -112,17 +112,19 @@ def make_layout(
     share: np.ndarray,
     multiple: np.ndarray,
     *,
+    linear: Sequence[bool] = (),
     measured: bool = False,
 ) -> Layout:
     """Index arrays and quadrature nodes of the static layers, in order.
 
     Args:
-        measured: whether the last of them is what the outputs are, a function of one signal.
+        linear: which of them are linear in what is random, for which the fewest nodes are exact;
+            by default none. measured: whether the last of them is what the outputs are, a function
+            of one signal.
     """
-    # Products of known signals with one that is normal are exact at the nodes of the third degree.
     sets = [
-        cubature(d) if form > PRODUCT else gauss_hermite(d)
-        for d, form in zip(channels, forms, strict=True)
+        cubature(d) if exact else gauss_hermite(d)
+        for d, exact in zip(channels, linear or [False] * len(channels), strict=True)
     ]
     widest = max(channels, default=1)
     most = max((len(w) for _, w in sets), default=1)

@@ -269,7 +269,7 @@ def test_both_functions_together_are_fitted_where_one_of_them_helps_and_leaves_s
 VARIANTS = (
     "feedback", "cube_of_output", "step_of_output", "root_of_output", "cube_of_hidden",
     "step_of_hidden", "root_of_hidden", "hidden_feedback", "feedback_product", "hidden_product",
-    "step", "forms", "hidden_forms", "compartments", "hysteresis", "both",
+    "step", "forms", "hidden_forms", "compartments", "states", "hysteresis", "both",
 )  # fmt: skip
 
 

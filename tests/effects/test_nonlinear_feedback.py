@@ -201,6 +201,7 @@ class TestBlock:
             {"g": (("inputs",), more), **dict.fromkeys(more[:2], output),
              **dict.fromkeys(more[2:], hidden)},
             {w.name: (w.sources, w.feedback) for w in dgp.Compartments(1).wires},
+            {"g": (("inputs",), ("feedback_products",)), "feedback_products": hidden},
             {"g": (("inputs",), ("feedback_hysteresis",)), "feedback_hysteresis": hidden},
             {"g": (("inputs",), ("feedback", *unseen)), "feedback": output,
              **dict.fromkeys(unseen, hidden)},
@@ -225,6 +226,7 @@ class TestBlock:
             "not measured, act back on them.",
             "'x' is the level of the last of 2 compartments: what flows out of one, by a root and "
             "over an edge, enters the next.",
+            "Products of signals of the dynamics of 'x' that are not measured act back on them.",
             "It depends on the past: a hysteresis of two signals of the dynamics of 'x' that are "
             "not measured acts back on them.",
             both,
@@ -244,7 +246,7 @@ class TestBlock:
         made = EFFECT.extend(dgp.LinearDynamicGP(1), said, spring)
         assert [one.dynamic[0][0].feedback[0] for one in made] == [
             *leading, "hidden_feedback", "output_root", "output_root", "root1",
-            "feedback_hysteresis", "feedback",
+            "feedback_products", "feedback_hysteresis", "feedback",
         ]  # fmt: skip
         assert made[-1].dynamic[0][0].feedback == (
             "feedback", "hidden_feedback", "feedback_step"
@@ -293,7 +295,7 @@ class TestBlock:
         """To a function of the output one of a hidden signal, and the other way round."""
         made = EFFECT.extend(dgp.LinearDynamicGP(1), SAID, spring)
         first, cube, _, _, cubed, _, _, second, product, hidden, _, forms, more, chain, *rest = made
-        past, both = rest
+        _, past, both = rest
         for model, one, other in (
             (cube, "cube_of_output", "hidden_feedback"), (cubed, "cube_of_hidden", "feedback")
         ):  # fmt: skip
@@ -322,7 +324,7 @@ class TestBlock:
         assert of_output | of_hidden in made
         for model in (more, both):
             assert len(EFFECT.extend(model, SAID, spring)) == 2  # products
-        assert len(EFFECT.extend(product, SAID, spring)) == 14
+        assert len(EFFECT.extend(product, SAID, spring)) == 15
         added = [one.dynamic[0][0].feedback for one in EFFECT.extend(past, SAID, spring)]
         assert ("feedback_hysteresis", "feedback") in added
         assert all(one.count("feedback_hysteresis") == 1 and len(one) > 1 for one in added)

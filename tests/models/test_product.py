@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import pickle
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,15 +11,33 @@ import torch
 
 import pyro_dynogp as dgp
 from pyro_dynogp.data.channels import DeadZone, Recorded, Trend
+from pyro_dynogp.effects.nonlinear_feedback import NonlinearFeedbackOfOutput
 from pyro_dynogp.inference.density import Potential
+from pyro_dynogp.inference.refit import refit
+from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.extended import extended_starts
-from pyro_dynogp.models.feedback_variants import with_feedback, with_products
+from pyro_dynogp.models.assembly import assemble
+from pyro_dynogp.models.feedback_variants import (
+    with_feedback,
+    with_products,
+    with_products_of_states,
+)
+from pyro_dynogp.models.forms import have_no_place
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.product import Products, factors, is_product
 from pyro_dynogp.models.variants import with_channel, without_channel
-from tests.models.closed_loops import ClosedLoop, check_gradient, make_record, system_at
+from pyro_dynogp.moments.functions import gauss_hermite
+from tests.models.closed_loops import (
+    ClosedLoop,
+    check_free_run,
+    check_gradient,
+    make_record,
+    system_at,
+)
 from tests.models.test_known import values_at as any_values_at
 
+EFFECT = NonlinearFeedbackOfOutput()
+SAID = SimpleNamespace(sentence="What the test said.", where={"output": "y"})
 CASES = pytest.mark.parametrize(
     ("inputs", "outputs", "hidden", "irregular"),
     [(1, 1, False, False), (3, 1, False, True), (2, 2, False, False), (2, 1, True, False)],
@@ -181,23 +200,105 @@ def test_as_many_signals_as_it_multiplies(sees, first, others, got):
         dgp.Cascade(2, layers, output="g")
 
 
-def test_in_the_filter_the_first_are_inputs_or_functions_of_inputs():
+def of_states(record, first=1, others=1, **options):
+    """Products of hidden signals, of so many with so many others."""
+    count = first + others
+    layer = dgp.Dynamic(pairs=2, feedback=("f",), hidden=count, **options)
+    product = dgp.Product(first, others, sees=("g_hidden",), name="f")
+    return dgp.Cascade(1, (layer, product), output="g").scaled_to(record)
+
+
+def test_known_factors_take_the_fewest_nodes():
+    """What is linear in the rest is exact there: functions of inputs are known, dynamics not."""
     record = make_record(1, missing=False)
-    loop = dgp.Dynamic(pairs=1, feedback=("f",), name="g")
-    for signals, right in (((), True), (("g0",), False)):
+    loop = {"pairs": 1, "feedback": ("f",), "name": "g", "sees": ("bent", "g0")}
+    for signal, nodes in (("bent", 4), ("g0", 25)):
         bent = dgp.Static(inducing=4, sees=("inputs",), name="bent")
         first = dgp.Dynamic(pairs=1, name="g0", sees=("inputs",))
-        product = dgp.Product(sees=(*(signals or ("bent",)), "g"), name="f")
-        layers = (bent, first, dgp.Dynamic(**{**vars(loop), "sees": ("bent", "g0")}), product)
+        product = dgp.Product(sees=(signal, "g"), name="f")
+        layers = (bent, first, dgp.Dynamic(**loop), product)
         model = dgp.Cascade(1, layers, output="g", integrate="all").scaled_to(record)
         (prepared,) = model.prepare(record)
         system = system_at(model, any_values_at(model, 0))
-        if right:
-            found = output_process(system, prepared).log_prob(prepared.observations)
-            assert bool(found.isfinite())
-            continue
-        with pytest.raises(ValueError, match="expected inputs, or functions of inputs alone"):
-            output_process(system, prepared).log_prob(prepared.observations)
+        layout = assemble(system, prepared.grid, prepared.scaled_inputs).problem.layout
+        assert layout.node_count[-1] == nodes
+        found = output_process(system, prepared).log_prob(prepared.observations)
+        assert bool(found.isfinite())
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_moments_of_products_are_exact(count):
+    """Of correlated normal signals, by Isserlis' theorem."""
+    nodes, weights = gauss_hermite(count)
+    rng = np.random.default_rng(count)
+    L, m = np.tril(rng.standard_normal((count, count))), rng.standard_normal(count)
+    S, z = L @ L.T, m + nodes @ L.T
+    f = z[:, 0] * z[:, 1]
+    mean = weights @ f
+    assert mean == pytest.approx(m[0] * m[1] + S[0, 1])
+    variance = S[0, 0] * S[1, 1] + S[0, 1] ** 2
+    variance += m[0] ** 2 * S[1, 1] + m[1] ** 2 * S[0, 0] + 2.0 * m[0] * m[1] * S[0, 1]
+    assert weights @ (f - mean) ** 2 == pytest.approx(variance)
+
+
+def test_free_runs_of_products_of_states_are_those_of_a_plain_simulation():
+    record = make_record(missing=False)
+    model = of_states(record, process_noise=False, feedthrough=False)
+    values = any_values_at(model, 3)
+    values |= {k: 0.2 * x for k, x in values.items() if k.endswith("_gain")}
+    check_free_run(model, values, record, lambda signals: signals[1] * signals[2], 1e-9)
+
+
+@pytest.mark.parametrize("others", [1, 2])
+def test_gradient_of_products_of_states(others):
+    record = make_record(n=25)
+    model = of_states(record, 1, others)
+    values = any_values_at(model, 1)
+    values |= {k: 0.3 * x for k, x in values.items() if k.endswith("_gain")}
+    check_gradient(Potential(model, (model.prepare(record),), values))
+
+
+def test_which_models_get_products_of_states():
+    model = with_products_of_states(dgp.LinearDynamicGP(1, pairs=2))
+    assert [w.sources for w in model.wires] == [("inputs",), ("g_hidden",)]
+    ((wire, layer),) = model.dynamic
+    assert (wire.feedback, layer.hidden, layer.substeps) == (("feedback_products",), 3, 3)
+    assert model.layers[1].outputs == 2
+    assert have_no_place(model.layers)
+    assert not have_no_place(with_products(dgp.LinearDynamicGP(1), hidden=True).layers)
+    for other in (
+        dgp.LinearDynamicGP(1, pairs=1), dgp.LinearDynamicGP(1, pairs=2, outputs=2),
+        dgp.NonlinearFeedback(1, pairs=2, hidden=1), model,
+    ):  # fmt: skip
+        assert with_products_of_states(other) is None
+
+
+def test_predator_and_prey_are_found_by_products_of_states():
+    """From a linear model, the prey measured: to little more than the noise."""
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(0.0, 0.3, 50), 12)[:, None]
+    x, y = np.array([0.8, 0.6]), np.empty(600)
+    for k in range(600):
+        y[k] = x[0]
+        for _ in range(20):
+            growth = [1.0 - 0.3 * x[0] - x[1] - u[k, 0], -0.6 + 0.9 * x[0]]
+            x = x + 0.01 * x * np.array(growth)
+    sd = 0.02 * y.std()
+    record = dgp.Record(0.2 * np.arange(600), u, (y + sd * rng.standard_normal(600))[:, None])
+    past, future = record[:400], record[400:]
+    line = dgp.fit(dgp.LinearDynamicGP(1, pairs=2), past, method="map", workers=1, progress=False)
+    model = with_products_of_states(line.model)
+    fit = refit(line, past, model=model, run=Run(0, workers=1))
+    before, after = (
+        np.sqrt(np.mean((one.forecast(past, future).mean[:, 0] - y[400:]) ** 2)) / sd
+        for one in (line, fit)
+    )
+    assert before > 4.0
+    assert after < 1.5
+    assert EFFECT.parameters(fit, SAID, past) == {}
+    assert EFFECT.sentence(SAID, model) == (
+        "Products of signals of the dynamics of 'y' that are not measured act back on them."
+    )
 
 
 @pytest.mark.parametrize("bad", [0, -1, 1.5, "two", None])
