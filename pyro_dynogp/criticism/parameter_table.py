@@ -11,7 +11,7 @@ from pyro_dynogp.criticism.physical import physical_quantities
 from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.models.arrival import DELAY
-from pyro_dynogp.models.selection import part, place_of, signal_of
+from pyro_dynogp.models.selection import part, signal_of
 from pyro_dynogp.models.wiring import INPUTS, Dynamic, Known, Static, Wire
 
 COLUMNS = ("mean", "sd", "2.5 %", "97.5 %", "unit")
@@ -105,7 +105,7 @@ def _lengthscales(fit: Fitted, wire: Wire) -> Iterator[Row]:
         else:
             width = wire.channels - len(seen) if own is None else own.layer.outputs
             known = [(source, 1.0, "")] * width
-        seen += known[part(source, len(known))] if place_of(source) is not None else known
+        seen += known[part(source, len(known))]
     if len(seen) != wire.channels:
         seen = [("what it sees", 1.0, "")] * wire.channels
     values = draws.reshape(len(draws), -1).numpy()

@@ -165,8 +165,7 @@ def _free_run(
         past, rest = record[:begin], record[begin:]
         runs = _runs(spread, past, rest, count, seed)
         few = min(len(component), len(runs))
-        holds = not fit.model.has_feedback or bool(holds_after(fit, past, rest).all())
-        if few and holds:
+        if few and bool(holds_after(fit, past, rest).all()):
             mean[begin:] = fit.forecast(past, rest, process_noise=noisy, seed=seed).mean
             component = np.concatenate([component[:few, :begin], runs[:few]], axis=1)
     return mean, component
@@ -178,12 +177,11 @@ def _runs(spread: Fit, past: Record, rest: Record, count: int, seed: int) -> np.
     A draw may have a first state so uncertain that nothing of the noise is left of its variance, or
     run away with what comes back.
     """
-    if spread.model.has_feedback:
-        holding = holds_after(spread, past, rest)
-        if not bool(holding.any()):
-            return np.empty((0, len(rest), rest.n_outputs))
-        if not bool(holding.all()):
-            spread = spread.with_draws({name: x[holding] for name, x in spread.draws.items()})
+    holding = holds_after(spread, past, rest)
+    if not bool(holding.any()):
+        return np.empty((0, len(rest), rest.n_outputs))
+    if not bool(holding.all()):
+        spread = spread.with_draws({name: x[holding] for name, x in spread.draws.items()})
     try:
         return runs_after(spread, past, rest, samples=count, seed=seed)
     except NotPositiveDefiniteError:

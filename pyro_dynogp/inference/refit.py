@@ -275,7 +275,7 @@ def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     if len(target.layers) > len(fit.model.layers):
         line = target.has_feedback and fit.model.is_linear
         if not run.steps and (not line or have_no_place(target.layers)):
-            many = any(layer.hidden > layer.outputs for _, layer in target.dynamic)
+            many = any(layer.mostly_hidden for _, layer in target.dynamic)
             count = REPLACED if many else FRESH
             starts += starting_points(target, records, run, count=count, steps=FRESH_STEPS)
         optimizer = _optimizer_of_layer(target)

@@ -75,7 +75,7 @@ def with_forms(model: Model, *, hidden: bool = False) -> Model | None:
     if not model.dynamic:
         return None
     seen, layer = model.dynamic[-1]
-    if layer.hidden > layer.outputs:
+    if layer.mostly_hidden:
         return None
     count = _hidden(layer) if hidden else 0
     forms = forms_of(seen.name, outputs=layer.outputs, hidden=count)

@@ -78,6 +78,11 @@ class Dynamic:
         return self.outputs + self.hidden
 
     @property
+    def mostly_hidden(self) -> bool:
+        """Whether there are more hidden signals than outputs."""
+        return self.hidden > self.outputs
+
+    @property
     def levels(self) -> int:
         """Number of integrators: one for each output, where there are any.
 

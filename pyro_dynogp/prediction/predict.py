@@ -87,8 +87,10 @@ def _after(
 def holds_after(fit: Fitted, past: Record, future: Record) -> Tensor:
     """Which draws (S,) of parameters have a state after a past that is finite.
 
-    Functions in feedback may make predictions run away before.
+    All of models without feedback: functions in it may make predictions run away before.
     """
+    if not fit.model.has_feedback:
+        return torch.ones(fit.n_draws, dtype=torch.bool)
     earlier, later, gap = following(fit, past, future)
     with torch.no_grad():
         _, given = _after(fit, earlier, later, gap, process_noise=False)

@@ -205,7 +205,7 @@ def cascade_optima(problem: Problem, run: Run, optimizer: Optimizer, steps: int)
     """
     model, records, learnt = problem.target, problem.records, problem.learnt
     unseen = model.has_real_poles or any(layer.hidden for _, layer in model.dynamic)
-    many = any(layer.hidden > layer.outputs for _, layer in model.dynamic)
+    many = any(layer.mostly_hidden for _, layer in model.dynamic)
     several = LOOPED if model.has_feedback and not unseen else HIDDEN if many else CURVED
     usual = several if model.has_function else RANDOM
     optima: list[Optimum] = []
