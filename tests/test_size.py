@@ -43,7 +43,7 @@ LINES = 31_500
 # optimum (390 lines), and layers that see single channels, and single forms and products of states
 # in feedback (330 lines).
 # To shrink.
-LINES_TODAY = 55_400
+LINES_TODAY = 55_450
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from pyro_dynogp.models.forms import Form, FormName, form_of, forms_of, signals_of, usual_substeps
+from pyro_dynogp.models.forms import Form, FormName, each_form, form_of, forms_of, usual_substeps
 from pyro_dynogp.models.layer import fed_back
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.product import Product, is_product
@@ -98,8 +98,7 @@ def with_form(model: Model, form: FormName, *, hidden: bool = False) -> Model | 
         return None
     seen, layer = model.dynamic[-1]
     outputs, count = (0, _hidden(layer)) if hidden else (layer.outputs, 0)
-    signals = signals_of(seen.name, outputs=outputs, hidden=count)
-    given = [Form(form, sees=(x,), name=f"{form}_of_{label}") for label, x in signals.items()]
+    given = each_form(form, seen.name, outputs=outputs, hidden=count)
     return _fed_back(model, given, hidden=count)
 
 

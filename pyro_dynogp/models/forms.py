@@ -111,6 +111,7 @@ FORMS: Mapping[FormName, tuple[Callable[..., Tensor], _Priors]] = MappingProxyTy
         "hysteresis": (hysteresis, HYSTERESIS),
     }
 )
+OF_ONE_SIGNAL: tuple[FormName, ...] = tuple(name for name in FORMS if name != "hysteresis")
 
 
 def Form(
@@ -190,6 +191,12 @@ def forms_of(name: str, *, outputs: int = 1, hidden: int = 0) -> list[Known]:
     stepped = signals_of(name, outputs=0 if hidden else outputs, hidden=hidden)
     seen += [(x, "step") for x in stepped]
     return [Form(form, sees=(signals[x],), name=f"{x}_{form}") for x, form in seen]
+
+
+def each_form(form: FormName, name: str, *, outputs: int = 0, hidden: int = 0) -> list[Known]:
+    """The same form of each output and hidden signal of a dynamic layer of that name."""
+    signals = signals_of(name, outputs=outputs, hidden=hidden)
+    return [Form(form, sees=(seen,), name=f"{form}_of_{x}") for x, seen in signals.items()]
 
 
 def signals_of(name: str, *, outputs: int, hidden: int) -> dict[str, str]:

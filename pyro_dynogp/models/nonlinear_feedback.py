@@ -7,7 +7,15 @@ from typing import Unpack
 from gpytorch.kernels import Kernel
 
 from pyro_dynogp.layers.noise import Gaussian, Likelihood
-from pyro_dynogp.models.forms import Form, form_of, forms_of, usual_substeps
+from pyro_dynogp.models.forms import (
+    OF_ONE_SIGNAL,
+    Form,
+    FormName,
+    each_form,
+    form_of,
+    forms_of,
+    usual_substeps,
+)
 from pyro_dynogp.models.layer import INDUCING, fed_back
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.structure import ModelOptions
@@ -22,7 +30,7 @@ def NonlinearFeedback(
     pairs: int = 1,
     hidden: int = 0,
     step: bool | None = None,
-    parametric: bool = False,
+    parametric: bool | FormName = False,
     substeps: int | None = None,
     inducing: int = INDUCING,
     kernel: Kernel | None = None,
@@ -41,7 +49,9 @@ def NonlinearFeedback(
 
     With `parametric` nothing is a Gaussian process: what comes back are a root and an edge of each
     output, and of each hidden signal, and a step of the latter, or of each output where there is no
-    hidden signal (see `Form`). Tanks and valves need fewer data so.
+    hidden signal (see `Form`). Tanks and valves need fewer data so. The name of a form is for a
+    shape that the plant is expected to have: that form of each output and hidden signal. A "cube"
+    is a spring that hardens or softens; it is fitted in seconds, and grows beyond the data.
 
     Arguments are those of `Wiener`. f sees all outputs and has as many; that of g is measured.
 
@@ -49,8 +59,8 @@ def NonlinearFeedback(
         hidden: number of signals that f2 sees and has as outputs.
         step: whether a step of the hidden signal, or of the output where there is none, comes back
             as well; by default with one hidden signal.
-        parametric: whether what comes back has parametric forms of one signal each; `step`,
-            `inducing` and `kernel` are of functions that are no such forms.
+        parametric: whether what comes back has parametric forms of one signal each, or the name of
+            one form; `step`, `inducing` and `kernel` are of functions that are no such forms.
         substeps: equal parts of each interval between samples in which the functions are computed
             anew; by default 3 with a `Form`, 1 without and beside dead times that are parameters.
         kernel: of the functions, a gpytorch kernel; by default Matern-5/2 with a lengthscale of at
@@ -62,16 +72,31 @@ def NonlinearFeedback(
         (['g', 'f'], 'g')
         >>> [wire.name for wire in NonlinearFeedback(1, hidden=1).wires]
         ['g', 'f1', 'f2', 'step']
+        >>> [wire.name for wire in NonlinearFeedback(1, parametric="cube").wires]
+        ['g', 'cube_of_output']
         >>> [wire.name for wire in NonlinearFeedback(1, parametric=True).wires]
         ['g', 'output_root', 'output_edge', 'output_step']
     """
     verify(hidden=hidden)
-    SWITCH.check("parametric", parametric)
+    if not isinstance(parametric, str):
+        SWITCH.check("parametric", parametric)
+    elif parametric not in OF_ONE_SIGNAL:
+        raise invalid(
+            "parametric", expected=f"True, False or one of {', '.join(map(repr, OF_ONE_SIGNAL))}",
+            got=repr(parametric),
+            advice="A Cascade takes other functions, see Form, Known and Product.",
+        )  # fmt: skip
     if step is not None:
         SWITCH.check("step", step)
     if parametric:
         _check_parametric(step, kernel, inducing)
-        functions: list[StaticLayer] = [*forms_of("g", outputs=outputs, hidden=hidden)]
+        functions: list[StaticLayer] = [
+            *(
+                each_form(parametric, "g", outputs=outputs, hidden=hidden)
+                if isinstance(parametric, str)
+                else forms_of("g", outputs=outputs, hidden=hidden)
+            )
+        ]
     else:
         functions = _smooth(outputs, hidden, step, inducing, kernel)
     if substeps is None:
@@ -115,6 +140,6 @@ def _check_parametric(step: bool | None, kernel: Kernel | None, inducing: int) -
     if step is not None or kernel is not None or inducing != INDUCING:
         raise invalid(
             "parametric", expected="False beside step, kernel or inducing",
-            got=f"True, step={step}, kernel={type(kernel).__name__}, inducing={inducing}",
+            got=f"step={step}, kernel={type(kernel).__name__}, inducing={inducing}",
             advice="They are of Gaussian processes, and of a step beside them.",
         )  # fmt: skip

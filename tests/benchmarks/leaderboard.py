@@ -125,6 +125,11 @@ ENTRIES: dict[str, tuple[Callable[[], Benchmark], Callable[[], dgp.Model], dict[
     "coupled drives 2": (lambda: drives(2), lambda: dgp.Wiener(1, pairs=3), {}),
     "Silverbox": (
         silverbox,
+        lambda: dgp.NonlinearFeedback(1, parametric="cube", process_noise=False),
+        {"restarts": 2},
+    ),
+    "Silverbox, Gaussian process": (
+        silverbox,
         lambda: dgp.NonlinearFeedback(1, process_noise=False),
         {"restarts": 2},
     ),

@@ -150,6 +150,40 @@ def test_the_parametric_model_has_them_alone():
         dgp.NonlinearFeedback(1, parametric=2)
 
 
+def test_the_parametric_model_has_one_form_alone():
+    wires = {w.name: w for w in dgp.NonlinearFeedback(1, parametric="cube").wires}
+    assert list(wires) == ["g", "cube_of_output"]
+    assert wires["g"].layer.substeps == 3
+    assert form_of(wires["cube_of_output"].layer) == "cube"
+    two = dgp.NonlinearFeedback(1, outputs=2, hidden=1, parametric="root").wires
+    names = ["g", "root_of_output_1", "root_of_output_2", "root_of_hidden"]
+    assert [w.name for w in two] == names
+    for unlike in ("hysteresis", "square"):
+        with pytest.raises(ValueError, match=f"parametric: expected True, .* got '{unlike}'"):
+            dgp.NonlinearFeedback(1, parametric=unlike)
+    with pytest.raises(ValueError, match="parametric: expected False beside step, kernel or"):
+        dgp.NonlinearFeedback(1, parametric="cube", step=True)
+
+
+def test_a_cube_forecasts_beyond_the_amplitudes_of_the_training_record():
+    generator = np.random.default_rng(0)
+    force = np.repeat(generator.uniform(-1.0, 1.0, 150), 4)
+    force *= np.where(np.arange(600) < 400, 3.0, 10.0)
+    state, positions, h = np.zeros(2), [], 0.005
+    for u in force:
+        positions.append(state[0])
+        for _ in range(10):  # semi-implicit Euler steps, of a spring that hardens
+            state[1] += h * (u - 0.6 * state[1] - 4.0 * state[0] - 4.0 * state[0] ** 3)
+            state[0] += h * state[1]
+    outputs = np.array(positions) + generator.normal(0.0, 0.005, 600)
+    record = dgp.Record(0.05 * np.arange(600), force, outputs)
+    assert np.abs(outputs[400:]).max() > 1.3 * np.abs(outputs[:400]).max()
+    model = dgp.NonlinearFeedback(1, parametric="cube", process_noise=False)
+    fit = dgp.fit(model, record[:400], method="map", workers=1, progress=False)
+    error = fit.forecast(record[:400], record[400:]).mean[:, 0] - outputs[400:]
+    assert np.sqrt(np.mean(error**2)) < 0.01  # of a standard deviation of 0.6
+
+
 def test_the_loop_adds_those_that_a_model_lacks():
     model = dgp.LinearDynamicGP(1)
     for hidden in (False, True):
