@@ -223,7 +223,28 @@ def fit(
         raise invalid("restarts", expected="a whole number >= 1 without a start", got="0")
     chosen.check(model, warm=start is not None)
     problem = Problem.of(model, record, start)
-    fitted = Fit.of(train_model(problem, chosen, run, checkpoint))
+    return _trained(problem, chosen, run, checkpoint)
+
+
+def fit_in_units(start: Fit, model: Model, record: Record, run: Run, **options: Any) -> Fit:
+    """`fit`, in the units of a fit of the same sites: what is learnt there holds as it is.
+
+    In units of other data inputs have another mean, which an integrator adds up.
+
+    Args:
+        start: the fit. model: of its sites. record: training record. run: how.
+        options: method, and others of `fit`.
+    """
+    problem = Problem.of(model, record, start, start.model.scaling)
+    chosen = method_of(options.pop("method"), model, options)
+    return _trained(problem, chosen, run)
+
+
+def _trained(
+    problem: Problem, method: Method, run: Run, checkpoint: str | Path | None = None
+) -> Fit:
+    """The fit of a problem, with its warnings."""
+    fitted = Fit.of(train_model(problem, method, run, checkpoint))
     for sentence in warnings_of(fitted):
         warn(f"fit: {sentence}")
     return fitted

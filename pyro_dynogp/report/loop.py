@@ -15,6 +15,7 @@ from pyro_dynogp.discrepancy.search_notes import said_of_hiding, said_of_time
 from pyro_dynogp.discrepancy.state import SearchState
 from pyro_dynogp.effects import CATALOGUE, Effect
 from pyro_dynogp.fitting import fit as fit_model
+from pyro_dynogp.fitting import fit_in_units
 from pyro_dynogp.inference.fitted import known_fit
 from pyro_dynogp.inference.isolation import isolated
 from pyro_dynogp.inference.refit import WARMUP, family_of, refit
@@ -178,21 +179,25 @@ def _final(
     an optimum of less data may be a poor one of more, and errors before would be too large. Models
     with functions are refitted first: in units of other data what is learnt is off, its free runs
     may be worse than those of a linear model, and a poor fresh optimum would take its place (245
-    nats below, with 1.5 times the error).
+    nats below, with 1.5 times the error). Those with feedback keep the units of block A, in which
+    the refit and the fit begin where the search has ended.
     Refits of the search are posterior modes; here the posterior is of the kind that the given fit
     has, and at least that of static functions is wanted. A step in feedback that the search added
     gets its substeps, which the search does without where they are no better.
     """
 
     def refitted(found: Fit) -> Fit:
-        model = replace(found.model, scaling=None)
         run = Run(found.seed, workers=1)
+        model = replace(found.model, scaling=None)
+        usual = model if found is fits[0] else with_usual_substeps(model, fits[0].model)
+        options = _method_of(given, usual)
+        if model.has_feedback:
+            near = refit(found, record, run=run)
+            return fit_in_units(near, usual, record, replace(run, restarts=1), **options)
         near = refit(found, record, model=model, run=run) if model.has_function else found
-        if found is not fits[0]:
-            model = with_usual_substeps(model, fits[0].model)
         return fit_model(
-            model, record, start=near, restarts=1 if model.has_function else None,
-            seed=found.seed, workers=1, progress=False, **_method_of(given, model),
+            usual, record, start=near, restarts=1 if model.has_function else None,
+            seed=found.seed, workers=1, progress=False, **options,
         )  # fmt: skip
 
     return parallel_map(refitted, fits, workers=workers, progress=progress, description="last fits")

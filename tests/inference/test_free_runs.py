@@ -163,11 +163,33 @@ def test_process_noise_begins_faint_after_climbs_without_any(monkeypatch):
     run = Run(0, 1, False)
     mode.climb(model, ready, starts, [starts[0]], run, steps=10, optimizer="adam")
     quiet, (learnt, noisy) = given
-    assert len(quiet) == 2
+    assert quiet[0] is starts[0]  # what is learnt climbs without any noise, too
+    assert len(quiet) == 3
     scale = "g_noise_gain_local_scale"
     assert torch.equal(learnt[scale], starts[0][scale])  # what is learnt stays
     assert torch.allclose(noisy[scale], FAINT * starts[0][scale])
     assert torch.equal(noisy["f_values"], quiet[0]["f_values"])
+
+
+def test_where_noise_does_not_pay_what_is_learnt_is_not_lost(monkeypatch):
+    """An axis with friction: of its refit a poor fresh start was left, 1350 nats below."""
+    model = spring().scaled_to(make_record(n=60))
+    ready = model.prepare(make_record(n=60))
+    learnt, fresh = starting_points(model, ready, Run(0, 1, False), count=2, steps=5)
+
+    def maximise(target, records, points, run, **options):
+        found = [
+            Optimum(0.0 if torch.equal(p["g_input_gain"], learnt["g_input_gain"]) else 9.0,
+                    dict(p), np.zeros(1), "")
+            for p in points
+        ]  # fmt: skip
+        return sorted(found, key=lambda one: one.energy)
+
+    monkeypatch.setattr(mode, "maximise", maximise)
+    monkeypatch.setattr(mode, "noise_pays", lambda *_: False)
+    run = Run(0, 1, False)
+    (found,) = mode.climb(model, ready, [fresh], [learnt], run, steps=10, optimizer="gauss-newton")
+    assert torch.equal(found.values["g_input_gain"], learnt["g_input_gain"])
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 import pyro_dynogp as dgp
@@ -13,7 +14,7 @@ from pyro_dynogp.report import loop
 
 @pytest.mark.parametrize(
     ("model", "fresh"),
-    [(dgp.Wiener(1), 1), (dgp.NonlinearFeedback(1), 1), (dgp.LinearDynamicGP(1), None)],
+    [(dgp.Wiener(1), 1), (dgp.LinearDynamicGP(1), None)],
 )
 def test_last_fits_have_fresh_starts_too(monkeypatch, model, fresh):
     """From what is learnt alone functions can end where they fit noise, poles at poor optima.
@@ -39,19 +40,37 @@ def test_last_fits_have_fresh_starts_too(monkeypatch, model, fresh):
     assert given["start"] is (near if model.has_function else found)
 
 
+def test_those_with_feedback_keep_the_units_of_block_a():
+    """In others the mean of the input is another one, which an integrator adds up."""
+    generator = np.random.default_rng(0)
+    u = np.concatenate([np.full(60, 1.0), generator.normal(3.0, 1.0, 60)])
+    y = np.cumsum(0.1 * u) + generator.normal(0.0, 0.01, 120)
+    record = dgp.Record(np.arange(120.0), u, y)
+    model = dgp.NonlinearFeedback(1, parametric="cube", substeps=1)
+    options = {"method": "map", "restarts": 1, "steps": 3, "workers": 1, "progress": False}
+    fit = dgp.fit(model, record[40:100], **options)
+    line = dgp.fit(dgp.LinearDynamicGP(1, pairs=1), record[40:100], **options)
+    (found,) = loop._final([fit], fit, record, 1, False)
+    assert found.model.scaling == fit.model.scaling
+    assert len(found.records[0].time) == 120
+    (found,) = loop._final([line], line, record, 1, False)
+    assert found.model.scaling == dgp.Scaling.from_records(record)
+
+
 def test_a_step_that_was_added_gets_its_substeps(monkeypatch):
     """The search does without them; what the user gave keeps what it has."""
     fitted, refitted = [], []
 
-    def fit(model, record, **options):
+    def fit(start, model, record, run, **options):
+        assert run.restarts == 1
         fitted.append(model.substeps)
         return model
 
-    def refit(found, record, *, model, run):
-        refitted.append(model.substeps)
+    def refit(found, record, *, run):
+        refitted.append(found.model.substeps)
         return found
 
-    monkeypatch.setattr(loop, "fit_model", fit)
+    monkeypatch.setattr(loop, "fit_in_units", fit)
     monkeypatch.setattr(loop, "refit", refit)
     added = with_feedback(dgp.LinearDynamicGP(1), hidden=True)
     smooth = with_feedback(dgp.LinearDynamicGP(1))

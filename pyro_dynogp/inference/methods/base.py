@@ -42,11 +42,16 @@ class Problem:
 
     @classmethod
     def of(
-        cls, model: Model, records: Record | Sequence[Record], start: Fitted | None = None
+        cls,
+        model: Model,
+        records: Record | Sequence[Record],
+        start: Fitted | None = None,
+        units: Scaling | None = None,
     ) -> Problem:
         """Records checked and prepared, the model in their units; `start` is a fit to start from.
 
-        Of a model with free dead times outputs are missing until inputs are likely to have arrived.
+        With `units` the model is in these. Of a model with free dead times outputs are missing
+        until inputs are likely to have arrived.
 
         Raises:
             ValueError: as of `Model.check`; on constant or entirely missing signals.
@@ -56,7 +61,7 @@ class Problem:
         if longest < FEWEST:
             expected = f"a record of {FEWEST} samples or more to fit to"
             raise invalid("record", expected=expected, got=f"{longest} samples")
-        scaling = Scaling.from_records(checked)
+        scaling = units or Scaling.from_records(checked)
         prepared = tuple(PreparedRecord.of(record, scaling) for record in checked)
         if model.late:
             prepared = without_unknown(model, prepared)

@@ -264,10 +264,11 @@ def climb(
 ) -> list[Optimum]:
     """Optima of the collapsed model from fresh starts and from what is learnt, best first.
 
-    Where static layers see process noise fresh starts take half of the steps without any, which
-    needs no filter, and the better half of them takes the other half with it. Such noise can
-    explain all that dynamics and functions should: from a poor start to a high density and poor
-    forecasts. With feedback, or beside a linear model, it stays only where it pays (`noise_pays`).
+    Where static layers see process noise starts take half of the steps without any, which needs no
+    filter, and the better half of them takes the other half with it; what is learnt takes all with
+    it, too. Such noise can explain all that dynamics and functions should: from a poor start to a
+    high density and poor forecasts. With feedback, or beside a linear model, it stays only where it
+    pays (`noise_pays`).
 
     Args:
         model: collapsed. records: of it. starts, learnt: values of all sites. run: how.
@@ -286,7 +287,7 @@ def climb(
     if quiet != model and starts:
         steps = max(1, steps // 2)
         key = f"{prefix}without-process-noise"
-        found = optima_of(quiet, [louder(start) for start in starts], key)
+        found = optima_of(quiet, [*learnt, *(louder(start) for start in starts)], key, len(learnt))
         better = found[: (len(starts) + 1) // 2]
         starts = [grown(one.values, faint(starts[0])) for one in better]
     elif model.has_feedback:
