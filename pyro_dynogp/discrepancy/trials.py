@@ -30,6 +30,10 @@ CONSTANT = 1e-12
 # Errors of forecasts are noise alone up to so many of its standard deviations: parameters learnt
 # from a few hundred samples add some percent, and so many errors tell their size to four.
 NOISE_ALONE = 1.1
+# Other dynamics are tried beside more than this: what an effect leaves that is not described is
+# several times the noise, and parameters of a step or a cube, learnt from 500 samples of systems
+# with friction, add up to half of it. They take most of the time.
+LITTLE_ELSE = 1.5
 
 
 @dataclass(frozen=True)
@@ -201,7 +205,8 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
     its last level, or else the last one, which leaves most open. Of others the first two are
     fitted, and later ones while none leaves nothing but noise; those that join what two earlier
     ones have, which take most of the time, only where one of these forecasts best, and better than
-    the base. Variants that cannot be fitted are left out.
+    the base; other dynamics only beside more than `LITTLE_ELSE`, of the noise of the base, too.
+    Variants that cannot be fitted are left out.
     """
     fold, settings = trial.folds[0], trial.settings
     problems: list[ValueError] = []
@@ -227,6 +232,9 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
                 leading, most, errors = max(found, key=lambda one: float(one[1].sum()))
                 if _are_noise(errors, leading):
                     break
+                little = all(_are_noise(errors, f, LITTLE_ELSE) for f in (leading, trial.base))
+                if little and _has_other_dynamics(model):
+                    continue
                 joined = [_back(one) for one in trial.models[:place] if _back(one) < _back(model)]
                 if len(joined) > 1:
                     least = held_out_density(trial.base, trial.record, fold, trial.score)
@@ -249,12 +257,17 @@ def _back(model: Model) -> set[str]:
     return {name for _, layer in model.dynamic for name in layer.feedback}
 
 
-def _are_noise(errors: np.ndarray, fit: Fit) -> bool:
-    """Whether errors (M, n_y) of forecasts are no larger than the noise that a fit has learnt."""
+def _has_other_dynamics(model: Model) -> bool:
+    """Whether dynamics are a chain of lags, or have more hidden signals than outputs."""
+    return any(layer.real or layer.mostly_hidden for _, layer in model.dynamic)
+
+
+def _are_noise(errors: np.ndarray, fit: Fit, most: float = NOISE_ALONE) -> bool:
+    """Whether errors (M, n_y) of forecasts are at most so often the noise that a fit has learnt."""
     if fit.system.noise.constant_sd is None:  # its size varies
         return False
     rmse = np.sqrt(np.nanmean(np.square(errors), axis=0))
-    return bool((rmse <= NOISE_ALONE * fit.noise_sd).all())
+    return bool((rmse <= most * fit.noise_sd).all())
 
 
 def _is_more_probable(one: Fit, best: Fit, gain: np.ndarray, settings: LoopSettings) -> bool:
