@@ -15,7 +15,7 @@ from pyro_dynogp.effects.bilinear import with_products_of_inputs
 from pyro_dynogp.effects.nonlinear_feedback import NonlinearFeedbackOfOutput, nonlinear_feedback
 from pyro_dynogp.models.feedback_variants import with_products
 from tests.discrepancy.made import SETTINGS
-from tests.effects.test_nonlinear_feedback import carried
+from tests.effects.heated import carried
 
 
 @pytest.fixture(scope="module")
