@@ -15,7 +15,8 @@ from pyro_dynogp.discrepancy.held_out_errors import one_step_errors
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
 from pyro_dynogp.models.delays import longest_delay, unknown_beginning
 from pyro_dynogp.models.limits import at_limits
-from pyro_dynogp.prediction.predict import holds_after, runs_after
+from pyro_dynogp.prediction.first_state import States
+from pyro_dynogp.prediction.predict import forecast, holds_after, runs_after, states_before
 from pyro_dynogp.statistics.evidence import Residuals
 from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.support.errors import invalid
@@ -51,8 +52,13 @@ def free_run_of(
     prepared = fit.model.check(record)[0]
     begin = unknown_beginning(record, longest_delay(fit.model)) + settling(fit, record, settings)
 
+    # They take longest, and are the same for all draws of the parameters.
+    states = None
+    if _has_past(fit, prepared, begin):
+        states = states_before(fit, prepared[:begin], prepared[begin:])
+
     def run(spread: Fit) -> tuple[np.ndarray, np.ndarray]:
-        return _free_run(fit, spread, prepared, begin, settings.draws, seed)
+        return _free_run(fit, spread, prepared, begin, settings.draws, seed, states)
 
     if fit.method != "map":
         mean, component = run(fit)
@@ -148,8 +154,19 @@ def residuals_of(
     )
 
 
+def _has_past(fit: Fit, record: Record, begin: int) -> bool:
+    """Whether outputs before a sample tell something of the state there."""
+    return bool(np.isfinite(record.outputs[:begin]).any() and poles_of(fit).size)
+
+
 def _free_run(
-    fit: Fit, spread: Fit, record: Record, begin: int, count: int, seed: int
+    fit: Fit,
+    spread: Fit,
+    record: Record,
+    begin: int,
+    count: int,
+    seed: int,
+    states: States | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean (n, n_y) of a free run from sample `begin` on, and draws of it (S, n, n_y).
 
@@ -161,29 +178,31 @@ def _free_run(
     component = spread.simulate(
         record, process_noise=noisy, samples=count, seed=seed
     ).component_mean
-    if np.isfinite(record.outputs[:begin]).any() and poles_of(fit).size:
+    if _has_past(fit, record, begin):
         past, rest = record[:begin], record[begin:]
-        runs = _runs(spread, past, rest, count, seed)
+        runs = _runs(spread, past, rest, count, seed, states)
         few = min(len(component), len(runs))
-        if few and bool(holds_after(fit, past, rest).all()):
-            mean[begin:] = fit.forecast(past, rest, process_noise=noisy, seed=seed).mean
+        if few and bool(holds_after(fit, past, rest, states).all()):
+            mean[begin:] = forecast(fit, past, rest, noisy, seed=seed, states=states).mean
             component = np.concatenate([component[:few, :begin], runs[:few]], axis=1)
     return mean, component
 
 
-def _runs(spread: Fit, past: Record, rest: Record, count: int, seed: int) -> np.ndarray:
+def _runs(
+    spread: Fit, past: Record, rest: Record, count: int, seed: int, states: States | None = None
+) -> np.ndarray:
     """Draws of a free run (S, n, n_y), of those parameter draws at which the filter can be run.
 
     A draw may have a first state so uncertain that nothing of the noise is left of its variance, or
     run away with what comes back.
     """
-    holding = holds_after(spread, past, rest)
+    holding = holds_after(spread, past, rest, states)
     if not bool(holding.any()):
         return np.empty((0, len(rest), rest.n_outputs))
     if not bool(holding.all()):
         spread = spread.with_draws({name: x[holding] for name, x in spread.draws.items()})
     try:
-        return runs_after(spread, past, rest, samples=count, seed=seed)
+        return runs_after(spread, past, rest, samples=count, seed=seed, states=states)
     except NotPositiveDefiniteError:
         if spread.n_draws == 1:
             return np.empty((0, len(rest), rest.n_outputs))
@@ -192,7 +211,7 @@ def _runs(spread: Fit, past: Record, rest: Record, count: int, seed: int) -> np.
         spread.with_draws({name: x.tensor_split(2)[half] for name, x in draws.items()})
         for half in (0, 1)
     ]
-    return np.concatenate([_runs(half, past, rest, count, seed) for half in halves])
+    return np.concatenate([_runs(half, past, rest, count, seed, states) for half in halves])
 
 
 def _spread(fit: Fit, count: int, seed: int) -> Fit:

@@ -17,6 +17,7 @@ from pyro_dynogp.models.system import System
 if TYPE_CHECKING:
     from pyro_dynogp.inference.fitted import Fitted
 
+States = Mapping[str, Tensor]
 # Samples from which a first state is estimated: it is forgotten soon after.
 SAMPLES = 400
 
@@ -26,7 +27,13 @@ def unknown_beginning(fit: Fitted) -> System:
     return fit.model.begin(fit.system, {})
 
 
-def beginning(fit: Fitted, record: PreparedRecord, *, predicting: bool = False) -> System:
+def beginning(
+    fit: Fitted,
+    record: PreparedRecord,
+    *,
+    predicting: bool = False,
+    states: States | None = None,
+) -> System:
     """The fitted system at the beginning of a record.
 
     On a training record the first state is that of the posterior draws. On another record that of
@@ -37,6 +44,7 @@ def beginning(fit: Fitted, record: PreparedRecord, *, predicting: bool = False) 
         fit: the fit. record: along which.
         predicting: whether first states that can be integrated out are unknown on training
             records, too: predictions serve every record in the same way.
+        states: of `estimated`, where they are there already.
     """
     model = fit.model
     if not model.state_sites or not record.has_outputs:
@@ -44,7 +52,7 @@ def beginning(fit: Fitted, record: PreparedRecord, *, predicting: bool = False) 
     index = training_index(fit, record)
     if index is not None:
         states = model.states_of(fit.draws, "" if len(fit.records) == 1 else f"_{index}")
-    else:
+    elif states is None:
         states = estimate(fit, record)
     if predicting:
         needed = {wire.name for wire in model.seen_by_functions}
@@ -56,6 +64,12 @@ def training_index(fit: Fitted, record: PreparedRecord) -> int | None:
     """Index of a record among the training records."""
     own = record.record.fingerprint
     return next((i for i, known in enumerate(fit.records) if known.fingerprint == own), None)
+
+
+def estimated(fit: Fitted, record: PreparedRecord) -> dict[str, Tensor] | None:
+    """First states that `beginning` estimates, which all draws share; None where it does not."""
+    known = not fit.model.state_sites or training_index(fit, record) is not None
+    return None if known or not record.has_outputs else estimate(fit, record)
 
 
 def estimate(fit: Fitted, record: PreparedRecord) -> dict[str, Tensor]:

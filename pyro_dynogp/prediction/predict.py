@@ -16,7 +16,7 @@ from pyro_dynogp.models.late_systems import arrive
 from pyro_dynogp.models.output_process import OutputProcess, flat
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.models.prepared import PreparedRecord, with_outputs
-from pyro_dynogp.prediction.first_state import beginning, unknown_beginning
+from pyro_dynogp.prediction.first_state import States, beginning, estimated, unknown_beginning
 from pyro_dynogp.prediction.free_run_variance import with_held_parameters
 from pyro_dynogp.prediction.prediction import Parts, Prediction
 from pyro_dynogp.prediction.records import following, prepared
@@ -51,11 +51,14 @@ def forecast(
     process_noise: bool = True,
     samples: int = 200,
     seed: int = 0,
+    states: States | None = None,
 ) -> Prediction:
-    """See `Fit.forecast`."""
+    """See `Fit.forecast`; `states`: of `states_before`, where they are there already."""
     earlier, later, gap = following(fit, past, future)
+    if states is None:
+        states = estimated(fit, earlier)
     with torch.no_grad():
-        before, start = _after(fit, earlier, later, gap, process_noise)
+        before, start = _after(fit, earlier, later, gap, process_noise, states)
         # Noise that follows the output continues from where the past has brought the output.
         time = np.append(past.time, past.time[-1] + gap + (future.time - future.time[0]))
         system = fit.system if process_noise else fit.system.without_process_noise
@@ -64,7 +67,7 @@ def forecast(
         outputs.noise_sd = before.system.noise_sd(inputs, time)[..., len(past) :, :]
         return _forward(
             fit, later, outputs, samples, seed, "forecast",
-            lambda other: _after(other, earlier, later, gap, process_noise=False)[1],
+            lambda other: _after(other, earlier, later, gap, False, states)[1],
         )  # fmt: skip
 
 
@@ -73,33 +76,49 @@ def _at_rest(fit: Fitted) -> JointState:
     return first_state(unknown_beginning(fit))
 
 
+def states_before(fit: Fitted, past: Record, future: Record) -> States | None:
+    """First states of a past that are estimated, for all draws of the parameters."""
+    return estimated(fit, following(fit, past, future)[0])
+
+
 def _after(
-    fit: Fitted, earlier: PreparedRecord, later: PreparedRecord, gap: float, process_noise: bool
+    fit: Fitted,
+    earlier: PreparedRecord,
+    later: PreparedRecord,
+    gap: float,
+    process_noise: bool,
+    states: States | None,
 ) -> tuple[OutputProcess, JointState]:
     """Outputs along a past, and the state at the first sample of what follows it."""
     with_outputs([earlier], "past")
-    before = output_process(beginning(fit, earlier, predicting=True), earlier)
+    before = output_process(beginning(fit, earlier, predicting=True, states=states), earlier)
     next_inputs = arrive(fit.system, later).inputs[..., 0, :]
     y = earlier.observations
     return before, before.state_after(y, gap, next_inputs, process_noise=process_noise)
 
 
-def holds_after(fit: Fitted, past: Record, future: Record) -> Tensor:
+def holds_after(fit: Fitted, past: Record, future: Record, states: States | None = None) -> Tensor:
     """Which draws (S,) of parameters have a state after a past that is finite.
 
     All of models without feedback: functions in it may make predictions run away before.
+    `states`: as of `forecast`.
     """
     if not fit.model.has_feedback:
         return torch.ones(fit.n_draws, dtype=torch.bool)
     earlier, later, gap = following(fit, past, future)
     with torch.no_grad():
-        _, given = _after(fit, earlier, later, gap, process_noise=False)
+        _, given = _after(fit, earlier, later, gap, False, states)
     finite = torch.isfinite(given.mean).all(-1) & torch.isfinite(given.covariance).all(-1).all(-1)
     return finite.expand(fit.n_draws)
 
 
 def runs_after(
-    fit: Fitted, past: Record, future: Record, samples: int = 200, seed: int = 0
+    fit: Fitted,
+    past: Record,
+    future: Record,
+    samples: int = 200,
+    seed: int = 0,
+    states: States | None = None,
 ) -> np.ndarray:
     """Outputs (S, n, n_y) without any noise, one for each draw of parameters and of the state.
 
@@ -108,13 +127,14 @@ def runs_after(
 
     Args:
         fit: the fit. past, future: as for `Fit.forecast`. samples, seed: of the draws.
+        states: as of `forecast`.
     """
     if not fit.model.is_linear:
-        found = forecast(fit, past, future, process_noise=False, samples=samples, seed=seed)
+        found = forecast(fit, past, future, False, samples, seed, states)
         return found.component_mean
     earlier, later, gap = following(fit, past, future)
     with torch.no_grad(), seeded(seed):
-        _, given = _after(fit, earlier, later, gap, process_noise=False)
+        _, given = _after(fit, earlier, later, gap, False, states)
         state = given.drawn(torch.randn(given.mean.shape, dtype=torch.float64))
         start = JointState(state, torch.zeros_like(given.covariance))
         outputs = output_process(fit.system.without_process_noise, later, start=start)
