@@ -226,6 +226,7 @@ def fit(
     return _trained(problem, chosen, run, checkpoint)
 
 
+@isolated
 def fit_in_units(start: Fit, model: Model, record: Record, run: Run, **options: Any) -> Fit:
     """`fit`, in the units of a fit of the same sites: what is learnt there holds as it is.
 
@@ -237,6 +238,7 @@ def fit_in_units(start: Fit, model: Model, record: Record, run: Run, **options: 
     """
     problem = Problem.of(model, record, start, start.model.scaling)
     chosen = method_of(options.pop("method"), model, options)
+    chosen.check(model, warm=True)
     return _trained(problem, chosen, run)
 
 

@@ -52,7 +52,7 @@ def free_run_of(
     prepared = fit.model.check(record)[0]
     begin = unknown_beginning(record, longest_delay(fit.model)) + settling(fit, record, settings)
 
-    # They take longest, and are the same for all draws of the parameters.
+    # First states take longest to estimate, and are the same for all draws of the parameters.
     states = None
     if _has_past(fit, prepared, begin):
         states = states_before(fit, prepared[:begin], prepared[begin:])

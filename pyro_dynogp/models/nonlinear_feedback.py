@@ -88,17 +88,15 @@ def NonlinearFeedback(
         )  # fmt: skip
     if step is not None:
         SWITCH.check("step", step)
+    functions: list[StaticLayer] = []
     if parametric:
         _check_parametric(step, kernel, inducing)
-        functions: list[StaticLayer] = [
-            *(
-                each_form(parametric, "g", outputs=outputs, hidden=hidden)
-                if isinstance(parametric, str)
-                else forms_of("g", outputs=outputs, hidden=hidden)
-            )
-        ]
+    if isinstance(parametric, str):
+        functions += each_form(parametric, "g", outputs=outputs, hidden=hidden)
+    elif parametric:
+        functions += forms_of("g", outputs=outputs, hidden=hidden)
     else:
-        functions = _smooth(outputs, hidden, step, inducing, kernel)
+        functions += _smooth(outputs, hidden, step, inducing, kernel)
     if substeps is None:
         forms = any(map(form_of, functions))
         substeps = usual_substeps(options.get("channels", ()), forms=forms)
