@@ -41,8 +41,8 @@ LINES = 31_500
 # which tests are 200), and means of levels over steps, and products of inputs beside those of the
 # output (240 lines), and a hysteresis in feedback and bands of parameters that stay at their
 # optimum (390 lines), and layers that see single channels, and single forms and products of states
-# in feedback (330 lines), and models of one form and last fits in the units of block A (80 lines), first states
-# that are estimated once (60 lines).
+# in feedback (330 lines), and models of one form and last fits in the units of block A (80 lines),
+# and first states that are estimated once (60 lines).
 # To shrink.
 LINES_TODAY = 55_530
 
