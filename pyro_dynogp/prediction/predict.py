@@ -87,7 +87,7 @@ def _after(
     later: PreparedRecord,
     gap: float,
     process_noise: bool,
-    states: States | None,
+    states: States | None = None,
 ) -> tuple[OutputProcess, JointState]:
     """Outputs along a past, and the state at the first sample of what follows it."""
     with_outputs([earlier], "past")
