@@ -232,8 +232,9 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
                 leading, most, errors = max(found, key=lambda one: float(one[1].sum()))
                 if _are_noise(errors, leading):
                     break
-                little = all(_are_noise(errors, f, LITTLE_ELSE) for f in (leading, trial.base))
-                if little and _has_other_dynamics(model):
+                if _has_other_dynamics(model) and all(
+                    _are_noise(errors, fit, LITTLE_ELSE) for fit in (leading, trial.base)
+                ):
                     continue
                 joined = [_back(one) for one in trial.models[:place] if _back(one) < _back(model)]
                 if len(joined) > 1:

@@ -39,6 +39,7 @@ class TestNumbers:
         at = np.quantile(spring.outputs[:, 0], (0.02, 0.35, 0.65, 0.98))
         force = STIFFNESS * at + 4.0 * at**3
         slopes = [pair[0] for pair in found.values()]
+        # A function learnt from 600 samples with 2 % noise: a slope is that of an estimate.
         np.testing.assert_allclose(slopes, np.diff(force) / np.diff(at), rtol=0.1)
         assert EFFECT.shape(found) == "It hardens to both ends."
 
@@ -62,6 +63,7 @@ class TestNumbers:
         y = (np.quantile(record.outputs, (0.02, 0.35, 0.65, 0.98)) - 1.0) / 0.5
         slope = (1.0 + y[1:] + y[:-1]) * 3.0 / 0.5  # (y + y^2) / G_u, G_u = 2 and 4
         expected = [(v * (1 / 2 + 1 / 4) / 2, abs(v) * (1 / 2 - 1 / 4) / 2) for v in slope]
+        # The same formula by hand: rounding alone, as in the test below.
         np.testing.assert_allclose(list(found.values()), expected, rtol=1e-12)
 
     def test_functions_of_the_output_add_up(self):
