@@ -2,21 +2,44 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import runpy
+import tempfile
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pyro
 import pytest
 import torch
+from joblib.externals.loky import get_reusable_executor
 from pyro.infer import Trace_ELBO
 
 import pyro_dynogp as dgp
 from tests import pages
 
 LINES = 120
+
+
+@contextlib.contextmanager
+def told():
+    """What warnings say meanwhile, here and on the error stream of new worker processes."""
+    get_reusable_executor().shutdown()
+    texts, before = [], os.dup(2)
+    with tempfile.TemporaryFile("w+") as stream:
+        os.dup2(stream.fileno(), 2)
+        try:
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always", UserWarning)
+                yield texts
+        finally:
+            os.dup2(before, 2)
+            os.close(before)
+        stream.seek(0)
+        texts += [str(each.message) for each in caught if each.category is UserWarning]
+        texts += [line for line in stream if "Warning:" in line]
 
 
 @pytest.fixture(scope="module")
@@ -26,12 +49,17 @@ def found(tmp_path_factory):
     os.chdir(tmp_path_factory.mktemp("readme"))
     pyro.set_rng_seed(0)
     try:
-        with pyro.get_param_store().scope():
+        with pyro.get_param_store().scope(), told() as texts:
             names = pages.run(pages.README)
         names["files"] = sorted(os.listdir())
+        names["texts"] = texts
     finally:
         os.chdir(before)
     return names
+
+
+def test_nothing_warns(found):
+    assert not found["texts"]
 
 
 def test_the_forecast_is_as_good_as_the_readme_says(found):

@@ -13,6 +13,7 @@ from pyro_dynogp.effects.base import Score
 from pyro_dynogp.fitting import Fit
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.prediction.first_state import beginning
+from pyro_dynogp.prediction.predict import forecast
 from pyro_dynogp.statistics.settings import LoopSettings
 
 
@@ -71,7 +72,7 @@ def forecast_errors(fit: Fit, record: Record, fold: np.ndarray) -> tuple[np.ndar
     error = np.full(prepared.outputs.shape, np.nan)
     sd = error.copy()
     for part in stretches(fold):
-        found = fit.forecast(prepared[: part.start], prepared[part], seed=fit.seed)
+        found = forecast(fit, prepared[: part.start], prepared[part], seed=fit.seed, warns=False)
         error[part] = prepared.outputs[part] - found.mean
         sd[part] = found.sd
     return error, sd

@@ -16,7 +16,13 @@ from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
 from pyro_dynogp.models.delays import longest_delay, unknown_beginning
 from pyro_dynogp.models.limits import at_limits
 from pyro_dynogp.prediction.first_state import States
-from pyro_dynogp.prediction.predict import forecast, holds_after, runs_after, states_before
+from pyro_dynogp.prediction.predict import (
+    forecast,
+    holds_after,
+    runs_after,
+    simulate,
+    states_before,
+)
 from pyro_dynogp.statistics.evidence import Residuals
 from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.support.errors import invalid
@@ -174,16 +180,15 @@ def _free_run(
     predictions before run away.
     """
     noisy = fit.model.is_linear
-    mean = fit.simulate(record, process_noise=noisy, seed=seed).mean
-    component = spread.simulate(
-        record, process_noise=noisy, samples=count, seed=seed
-    ).component_mean
+    mean = simulate(fit, record, noisy, seed=seed, warns=False).mean
+    component = simulate(spread, record, noisy, count, seed, warns=False).component_mean
     if _has_past(fit, record, begin):
         past, rest = record[:begin], record[begin:]
         runs = _runs(spread, past, rest, count, seed, states)
         few = min(len(component), len(runs))
         if few and bool(holds_after(fit, past, rest, states).all()):
-            mean[begin:] = forecast(fit, past, rest, noisy, seed=seed, states=states).mean
+            found = forecast(fit, past, rest, noisy, seed=seed, states=states, warns=False)
+            mean[begin:] = found.mean
             component = np.concatenate([component[:few, :begin], runs[:few]], axis=1)
     return mean, component
 

@@ -33,15 +33,23 @@ JOINT = ", errors drawn jointly"
 
 
 def simulate(
-    fit: Fitted, record: Record, process_noise: bool = True, samples: int = 200, seed: int = 0
+    fit: Fitted,
+    record: Record,
+    process_noise: bool = True,
+    samples: int = 200,
+    seed: int = 0,
+    warns: bool = True,
 ) -> Prediction:
-    """See `Fit.simulate`."""
+    """See `Fit.simulate`; `warns`: as of `forecast`."""
     along = prepared(fit, record)
     with torch.no_grad():
         system = unknown_beginning(fit)
         system = system if process_noise else system.without_process_noise
         outputs = output_process(system, along)
-        return _forward(fit, along, outputs, samples, seed, "simulation", _at_rest)
+        found = _forward(fit, along, outputs, samples, seed, "simulation", _at_rest)
+    if warns:
+        _warn_of_divergence(fit, found)
+    return found
 
 
 def forecast(
@@ -52,8 +60,12 @@ def forecast(
     samples: int = 200,
     seed: int = 0,
     states: States | None = None,
+    warns: bool = True,
 ) -> Prediction:
-    """See `Fit.forecast`; `states`: of `states_before`, where they are there already."""
+    """See `Fit.forecast`; `states`: of `states_before`, where they are there already.
+
+    `warns`: False for candidates, which their errors judge: no user hears that one diverges.
+    """
     earlier, later, gap = following(fit, past, future)
     if states is None:
         states = estimated(fit, earlier)
@@ -65,10 +77,13 @@ def forecast(
         outputs = output_process(system, later, start=start)
         inputs = torch.cat([before.scaled_inputs, outputs.scaled_inputs], -2)
         outputs.noise_sd = before.system.noise_sd(inputs, time)[..., len(past) :, :]
-        return _forward(
+        found = _forward(
             fit, later, outputs, samples, seed, "forecast",
             lambda other: _after(other, earlier, later, gap, False, states)[1],
         )  # fmt: skip
+    if warns:
+        _warn_of_divergence(fit, found)
+    return found
 
 
 def _at_rest(fit: Fitted) -> JointState:
@@ -130,7 +145,7 @@ def runs_after(
         states: as of `forecast`.
     """
     if not fit.model.is_linear:
-        found = forecast(fit, past, future, False, samples, seed, states)
+        found = forecast(fit, past, future, False, samples, seed, states, warns=False)
         return found.component_mean
     earlier, later, gap = following(fit, past, future)
     with torch.no_grad(), seeded(seed):
@@ -153,8 +168,6 @@ def _forward(
     """Outputs from a first state and the inputs."""
     found = outputs.components(samples=samples, seed=seed, several_channels=not fit.collapsed)
     found = with_held_parameters(fit, found, record, begin, seed)
-    if fit.model.has_feedback:
-        warn_of_divergence(fit, record.record, found.mean, kind)
     names = fit.scaling.output_names
     return Prediction(
         record.record.time, names, found.mean, found.variance, found.noise_variance,
@@ -162,8 +175,11 @@ def _forward(
     )  # fmt: skip
 
 
-def warn_of_divergence(fit: Fitted, record: Record, runs: np.ndarray, kind: str) -> None:
-    """Warn where free runs (S, n, n_y) leave the range of the training outputs far behind."""
+def _warn_of_divergence(fit: Fitted, found: Prediction) -> None:
+    """Warn where free runs leave the range of the training outputs far behind."""
+    if not fit.model.has_feedback:
+        return
+    runs = found.component_mean
     known = np.concatenate([one.outputs for one in fit.records])
     low, high = np.nanmin(known, 0), np.nanmax(known, 0)
     margin = FAR * (high - low)
@@ -171,9 +187,9 @@ def warn_of_divergence(fit: Fitted, record: Record, runs: np.ndarray, kind: str)
     if left.any():
         first = int(left.any(0).argmax())
         warn(
-            f"{kind}: {left.any(1).sum()} of {len(runs)} free runs leave the range of the training "
-            f"outputs by more than {FAR:g} times its width, first at sample {first} (time "
-            f"{record.time[first]:.6g}). What follows is no prediction."
+            f"{found.kind}: {left.any(1).sum()} of {len(runs)} free runs leave the range of the "
+            f"training outputs by more than {FAR:g} times its width, first at sample {first} "
+            f"(time {found.time[first]:.6g}). What follows is no prediction."
         )
 
 

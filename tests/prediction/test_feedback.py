@@ -7,9 +7,12 @@ import pytest
 import torch
 
 import pyro_dynogp as dgp
+from pyro_dynogp.discrepancy.held_out import forecast_errors
+from pyro_dynogp.discrepancy.residuals import free_run_of
 from pyro_dynogp.inference.free_runs import free_run_error
 from pyro_dynogp.models.draws import JointState
 from pyro_dynogp.models.outputs import output_process
+from pyro_dynogp.statistics.settings import LoopSettings
 from tests.models.closed_loops import spring
 
 STEP = 0.05
@@ -164,9 +167,16 @@ def test_runs_that_diverge_are_reported_where_they_do(fitted):
     wild = mode.with_draws(dict(mode.draws) | {"g_input_gain": gain[None]})
     with pytest.warns(UserWarning, match=r"simulation: .* first at sample \d+ "):
         wild.simulate(record)
+    at_once = [record[:3], record[3:]]  # from a known state it takes a while
+    with pytest.warns(UserWarning, match=r"forecast: .* first at sample \d+ "):
+        wild.forecast(*at_once)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         fit.forecast(record[:450], record[450:])
+        # The loop tries candidates, and tests the residuals of those that it keeps.
+        later = np.arange(len(record)) >= 3
+        forecast_errors(wild, record, later)
+        free_run_of(wild, record, held_out=later, seed=0, settings=LoopSettings())
 
 
 def test_several_records_and_another_step():
