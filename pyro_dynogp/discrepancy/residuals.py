@@ -19,6 +19,8 @@ from pyro_dynogp.prediction.first_state import States
 from pyro_dynogp.prediction.predict import (
     forecast,
     holds_after,
+    leave_range,
+    predict,
     runs_after,
     simulate,
     states_before,
@@ -72,6 +74,9 @@ def free_run_of(
         mean, component = _straight(run, fit, settings.draws, seed)
     else:
         mean, component = run(_spread(fit, settings.draws, seed))
+    if fit.model.has_feedback:  # what runs away is no spread of what was learnt
+        holds = ~leave_range(fit, component[:, begin:]).any(1)
+        component = component[holds] if holds.any() else component
     chosen = np.linspace(0, len(component) - 1, min(settings.draws, len(component))).astype(int)
     drawn = component[chosen]
     errors = one_step_errors(fit, record, held_out)
@@ -112,7 +117,8 @@ def residuals_of(
     The output counts as missing until the model knows its inputs, until a simulation whose first
     state is unknown would have settled, and where it is exactly at a limit that the model knows.
     The free run begins then, with the state that the filter has found in the outputs before: slow
-    poles, and several alike, remember for longer.
+    poles, and several alike, remember for longer. From where it leaves the range of the training
+    outputs far behind the output counts as missing, too.
 
     Args:
         fit: the fit. record: along which, in one piece.
@@ -134,8 +140,11 @@ def residuals_of(
     if run is None:
         run = free_run_of(fit, record, held_out=held_out, seed=seed, settings=settings)
     driving = prepared.n_inputs - count_direct(fit.model.channels)
-    y = record.outputs[:, output].copy()
+    y, mean = record.outputs[:, output].copy(), run.mean[:, output]
     y[: run.begin] = np.nan
+    if fit.model.has_feedback:  # what follows a run that leaves the range is no prediction
+        away = np.logical_or.accumulate(leave_range(fit, run.mean[None])[0])
+        y[away], mean = np.nan, np.where(away, float(fit.scaling.output_offset[output]), mean)
     innovations = run.errors[:, output]
     # A sensor at its limit says nothing of the error there.
     stopped = at_limits(fit.model.layers, prepared)
@@ -143,7 +152,7 @@ def residuals_of(
     return Residuals(
         time=record.time,
         output=y,
-        mean=run.mean[:, output],
+        mean=mean,
         deviations=run.deviations[..., output],
         innovations=innovations,
         poles=poles_of(fit),
@@ -177,7 +186,9 @@ def _free_run(
     """Mean (n, n_y) of a free run from sample `begin` on, and draws of it (S, n, n_y).
 
     Before, and along all of a record without outputs there, from an unknown first state; so where
-    predictions before run away.
+    predictions before run away. Where functions in feedback make free runs from an unknown state
+    run away, predictions one step ahead stand before: no residual is taken there, but tests see the
+    past of each sample.
     """
     noisy = fit.model.is_linear
     mean = simulate(fit, record, noisy, seed=seed, warns=False).mean
@@ -190,6 +201,8 @@ def _free_run(
             found = forecast(fit, past, rest, noisy, seed=seed, states=states, warns=False)
             mean[begin:] = found.mean
             component = np.concatenate([component[:few, :begin], runs[:few]], axis=1)
+            if fit.model.has_feedback and leave_range(fit, component[:, :begin]).any():
+                mean[:begin] = component[:, :begin] = predict(fit, past).mean
     return mean, component
 
 

@@ -175,15 +175,21 @@ def _forward(
     )  # fmt: skip
 
 
+def leave_range(fit: Fitted, runs: np.ndarray) -> np.ndarray:
+    """Where (S, n) free runs (S, n, n_y) leave the range of the training outputs far behind."""
+    known = np.concatenate([one.outputs for one in fit.records])
+    low, high = np.nanmin(known, 0), np.nanmax(known, 0)
+    margin = FAR * (high - low)
+    left: np.ndarray = ~((runs > low - margin) & (runs < high + margin)).all(-1)
+    return left
+
+
 def _warn_of_divergence(fit: Fitted, found: Prediction) -> None:
     """Warn where free runs leave the range of the training outputs far behind."""
     if not fit.model.has_feedback:
         return
     runs = found.component_mean
-    known = np.concatenate([one.outputs for one in fit.records])
-    low, high = np.nanmin(known, 0), np.nanmax(known, 0)
-    margin = FAR * (high - low)
-    left = ~((runs > low - margin) & (runs < high + margin)).all(-1)
+    left = leave_range(fit, runs)
     if left.any():
         first = int(left.any(0).argmax())
         warn(

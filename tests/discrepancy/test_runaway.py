@@ -83,3 +83,56 @@ def test_effects_of_a_model_that_runs_away_are_not_tested_on_the_last_block(fit,
     sealed = np.zeros(len(record), dtype=bool)
     assert last_tests(found, (fit, fit), record, sealed, rounds) == {"another": (0.25, 0.25)}
     assert last_tests([], (fit, fit), record, sealed, rounds) == {}
+
+
+HELD_OUT = np.arange(120) >= 90
+
+
+def test_before_the_first_sample_that_counts_predictions_take_the_place_of_runs(
+    fit, record, monkeypatch
+):
+    """From an unknown first state they run away here; the filter of the outputs does not."""
+    given = {"held_out": HELD_OUT, "seed": 0, "settings": SETTINGS}
+    plain = residuals.free_run_of(fit, record, **given)
+    begin, simulate = plain.begin, residuals.simulate
+    assert 0 < begin < 60
+
+    def exploding(*arguments, **options):
+        found = simulate(*arguments, **options)
+        found.component_mean[:, begin // 2 :] = np.inf
+        return found
+
+    monkeypatch.setattr(residuals, "simulate", exploding)
+    found = residuals.free_run_of(fit, record, **given)
+    ahead = fit.predict(record[:begin]).mean
+    np.testing.assert_allclose(found.mean[:begin], ahead)
+    np.testing.assert_allclose(found.deviations[:, :begin], 0.0, atol=1e-10)
+    np.testing.assert_allclose(found.mean[begin:], plain.mean[begin:])
+
+
+def test_draws_that_run_away_are_no_spread(fit, record, monkeypatch):
+    given = {"held_out": HELD_OUT, "seed": 0, "settings": SETTINGS}
+    runs = residuals._runs
+
+    def exploding(*arguments):
+        found = runs(*arguments).copy()
+        found[: len(found) // 4, -1] = 1e80
+        return found
+
+    monkeypatch.setattr(residuals, "_runs", exploding)
+    found = residuals.free_run_of(fit, record, **given)
+    assert len(found.deviations) == SETTINGS.draws
+    assert np.abs(found.deviations).max() < 1e3
+
+
+def test_from_where_a_run_leaves_the_range_the_output_counts_as_missing(fit, record):
+    run = residuals.free_run_of(fit, record, held_out=HELD_OUT, seed=0, settings=SETTINGS)
+    mean = run.mean.copy()
+    mean[100] += 10.0 * np.ptp(record.outputs)  # and what comes after it, where it returns
+    mean[110:] = np.nan
+    found = residuals.residuals_of(
+        fit, record, held_out=HELD_OUT, settings=SETTINGS, run=replace(run, mean=mean)
+    )
+    there = np.flatnonzero(np.isfinite(found.residual))
+    assert (there[0], there[-1]) == (run.begin, 99)
+    assert np.isfinite(found.mean).all()

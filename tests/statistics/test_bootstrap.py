@@ -69,7 +69,7 @@ def test_the_same_seed_makes_the_same_replicates_however_many():
     np.testing.assert_array_equal(replicates(noise, 130, 4)[:70], replicates(noise, 70, 4))
     assert (replicates(noise, 70, 4) != replicates(noise, 70, 5)).any()
     sizes = [len(b) for b in batches(lambda generator, size: np.zeros(size), 130, 0)]
-    assert sizes == [50, 50, 30]
+    assert sizes == [10, 10, 20, 40, 50]
 
 
 def test_a_bias_that_is_known_is_taken_out():
