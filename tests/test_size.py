@@ -42,10 +42,10 @@ LINES = 31_500
 # output (240 lines), and a hysteresis in feedback and bands of parameters that stay at their
 # optimum (390 lines), and layers that see single channels, and single forms and products of states
 # in feedback (330 lines), and models of one form and last fits in the units of block A (80 lines),
-# and first states that are estimated once (60 lines), and candidates that diverge unheard (30
+# and first states that are estimated once (60 lines), and candidates that diverge unheard (60
 # lines).
 # To shrink.
-LINES_TODAY = 55_560
+LINES_TODAY = 55_590
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

@@ -249,7 +249,11 @@ def draw_static(
     # Functions of one channel are read off a fine grid: far fewer kernel evaluations.
     batch = function.batch_shape
     over = tuple(range(x.dim() - 2 - len(batch)))
-    low, high = (x.amin(over), x.amax(over)) if over else (x, x)
+    # Runs that grow without bound leave the others their grid: beyond it functions are straight.
+    ends = [part.unsqueeze(-2) for part in function.locations.aminmax(dim=-2)]
+    far = WIDEST * (ends[1] - ends[0])
+    near = x.clamp(ends[0] - far, ends[1] + far).where(x.isfinite(), ends[0])
+    low, high = (near.amin(over), near.amax(over)) if over else (near, near)
     low, high = low.amin(-2).squeeze(-1), high.amax(-2).squeeze(-1) + 1e-9
     share = torch.linspace(0.0, 1.0, FINE, dtype=torch.float64)
     grid = (low.unsqueeze(-1) + (high - low).unsqueeze(-1) * share).unsqueeze(-1)
@@ -267,13 +271,14 @@ def draw_static(
 
 # Most entries of a kernel matrix along a trajectory (32 MB).
 KERNEL_ENTRIES = 4_000_000
-# Points of the grid that a function of one channel is read off.
-FINE = 1025
+# Points of the grid that a function of one channel is read off, and how far the grid goes beyond
+# the points where the function is learnt, at most [their width].
+FINE, WIDEST = 1025, 3.0
 
 
 def _read(values: Tensor, place: Tensor) -> Tensor:
     """Linear interpolation of values (*b, FINE, e) at places (*s, n): (*s, n, e)."""
-    first = place.floor().clamp(0, FINE - 2).long()
+    first = place.nan_to_num().floor().clamp(0, FINE - 2).long()
     part = (place - first).unsqueeze(-1)
     full = values.expand((*first.shape[:-1], *values.shape[-2:]))
     index = first.unsqueeze(-1).expand((*first.shape, values.shape[-1]))

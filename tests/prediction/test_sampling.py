@@ -107,6 +107,33 @@ def test_each_switch_acts_on_its_own_layers_only(cause):
     assert all(torch.equal(again.signals[name], one.signals[name]) for name in names)
 
 
+def test_runs_that_grow_without_bound_leave_the_other_draws_as_they_are():
+    """Those are lost alone: not a number, or far out on the function's straight end."""
+    model, record = case("Wiener-Hammerstein")
+    values = parameters(model, draw(model, record))
+    with pyro.poutine.condition(data=values):
+        system = model.sample_system(model.scaling)
+    ((place, layer),) = [
+        x for x in zip(system.wires, system.layers, strict=True) if x[0].name == "f"
+    ]
+    residual = random_numbers(system, len(record), 4).residual["f"]
+    x = layer.function.locations.mean() + 0.3 * torch.randn(4, len(record), 1).double()
+    far = x.clone()
+    far[1, 5:] = torch.nan
+    far[2, 5:] = 1e60
+    far[3, 5:] = -torch.inf
+    drawing = Switches(False, frozenset(), True)
+    for switches in (OFF, drawing):
+        plain, beside = (
+            sampling.draw_static(place.layer.support, layer, signal, residual, switches)
+            for signal in (x, far)
+        )
+        for a, b in zip(plain, beside, strict=True):
+            there = torch.isfinite(far).expand(a.shape) & (far.abs() < 1e3)
+            torch.testing.assert_close(b[there], a[there], rtol=1e-3, atol=1e-3)
+        assert torch.isnan(beside[0][1, 5:]).all()
+
+
 def test_all_on_names_the_layers_that_have_process_noise():
     model, _ = case("Wiener-Hammerstein")
     system = model.sample_system(model.scaling)
