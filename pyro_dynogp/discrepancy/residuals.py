@@ -201,7 +201,8 @@ def _free_run(
             found = forecast(fit, past, rest, noisy, seed=seed, states=states, warns=False)
             mean[begin:] = found.mean
             component = np.concatenate([component[:few, :begin], runs[:few]], axis=1)
-            if fit.model.has_feedback and leave_range(fit, component[:, :begin]).any():
+            before = np.concatenate([mean[None], component])[:, :begin]
+            if fit.model.has_feedback and leave_range(fit, before).any():
                 mean[:begin] = component[:, :begin] = predict(fit, past).mean
     return mean, component
 

@@ -22,6 +22,7 @@ from pyro_dynogp.effects.hysteresis import hysteresis
 from pyro_dynogp.effects.level_shift import level_shift
 from pyro_dynogp.effects.periodic import periodic_disturbance
 from pyro_dynogp.effects.saturation import saturation
+from pyro_dynogp.statistics import bootstrap
 from pyro_dynogp.statistics.autoregression import fitted_filter
 from pyro_dynogp.statistics.bootstrap import tail_probability
 from pyro_dynogp.statistics.prewhitening import Projection, Variants, prewhitened
@@ -45,7 +46,8 @@ def test_only_the_loop_and_the_command_make_settings():
     assert makers == {"report/loop.py", "cli/close_loop.py"}
 
 
-def test_every_p_value_has_as_many_replicates():
+def test_every_p_value_has_as_many_replicates(monkeypatch):
+    monkeypatch.setattr(bootstrap, "FEWEST", 50)  # all at once, where one exceedance ends them
     x = coloured(np.random.default_rng(0), 200, 0.5)
     column = coloured(np.random.default_rng(1), (200, 1), 0.5)
     none, constant = np.zeros((0, 200)), np.ones((200, 1))

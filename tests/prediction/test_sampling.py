@@ -117,7 +117,9 @@ def test_runs_that_grow_without_bound_leave_the_other_draws_as_they_are():
         x for x in zip(system.wires, system.layers, strict=True) if x[0].name == "f"
     ]
     residual = random_numbers(system, len(record), 4).residual["f"]
-    x = layer.function.locations.mean() + 0.3 * torch.randn(4, len(record), 1).double()
+    x = layer.function.locations.mean() + 0.3 * torch.randn(
+        4, len(record), 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     far = x.clone()
     far[1, 5:] = torch.nan
     far[2, 5:] = 1e60
@@ -130,7 +132,7 @@ def test_runs_that_grow_without_bound_leave_the_other_draws_as_they_are():
         )
         for a, b in zip(plain, beside, strict=True):
             there = torch.isfinite(far).expand(a.shape) & (far.abs() < 1e3)
-            torch.testing.assert_close(b[there], a[there], rtol=1e-3, atol=1e-3)
+            torch.testing.assert_close(b[there], a[there], rtol=0.0, atol=5e-3)
         assert torch.isnan(beside[0][1, 5:]).all()
 
 
