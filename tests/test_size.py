@@ -43,9 +43,10 @@ LINES = 31_500
 # optimum (390 lines), and layers that see single channels, and single forms and products of states
 # in feedback (330 lines), and models of one form and last fits in the units of block A (80 lines),
 # and first states that are estimated once (60 lines), and candidates that diverge unheard (60
-# lines).
+# lines), and functions in feedback that are not tried beside what leaves noise
+# alone (50 lines).
 # To shrink.
-LINES_TODAY = 55_590
+LINES_TODAY = 55_635
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

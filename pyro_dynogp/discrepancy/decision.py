@@ -15,12 +15,14 @@ from pyro_dynogp.discrepancy.refits import Refits
 from pyro_dynogp.discrepancy.result import Attempt
 from pyro_dynogp.discrepancy.search import Candidate, Found
 from pyro_dynogp.discrepancy.stretches import latest
+from pyro_dynogp.discrepancy.trials import LITTLE_ELSE, NOISE_ALONE, are_noise
 from pyro_dynogp.fitting import Fit
 from pyro_dynogp.inference.bayes_factor import VERY_STRONG, counted, log_bayes_factor
 from pyro_dynogp.models.variants import Model
 from pyro_dynogp.statistics.settings import LoopSettings
 
 CERTAIN_FIRST = "what certainly lies between inputs and output comes first"
+LITTLE_LEFT = "with what the residual speaks more for, little else than noise is left"
 LATE = "the time limit was passed"
 
 
@@ -79,12 +81,13 @@ def confirm(
     )
     structure = [one for one in candidates if kind_of(one[0])[1] == "forecast"]
     sure = [one for one in structure if one[0].q_value <= level]
-    judged = refits.by_evidence(refits.settled(refits.judge(sure), level), level)
+    judged = refits.by_evidence(refits.settled(_judged(refits, sure, ()), level), level)
     certain = {one.found.effect.family for one in judged if one.helps}
-    judged += refits.judge([
+    further = [
         one for one in structure
         if one not in sure and (not certain or one[0].effect.family in certain)
-    ])  # fmt: skip
+    ]  # fmt: skip
+    judged += _judged(refits, further, judged)
     if not certain:
         first = confirmed_together(refits, judged, level)
         judged = [first if first and one.found is first.found else one for one in judged]
@@ -95,10 +98,11 @@ def confirm(
     judged = sorted(judged, key=lambda one: places[id(one.found)])
     done = [id(one.found) for one in judged]
     untried = [
-        Attempt(number, found.evidence, found.q_value, "not tried", CERTAIN_FIRST)
-        for found, _ in candidates
-        if id(found) not in done
-    ]
+        Attempt(number, one[0].evidence, one[0].q_value, "not tried",
+                LITTLE_LEFT if _is_needless(refits, one, judged) else CERTAIN_FIRST)
+        for one in candidates
+        if id(one[0]) not in done
+    ]  # fmt: skip
     while better := _first_in_line([one for one in judged if one.helps], level):
         playing = refits.on_one_scale(better) if not refits.early else []
         if refits.early:
@@ -129,6 +133,45 @@ def confirm(
         attempt=next(a for a in decided if a.decision == "accepted"),
         fit=tried.fit if winner.kind[0] == "after" else None,
         ties=tuple(one for one in names if one != name),
+    )
+
+
+def _judged(
+    refits: Refits, candidates: Sequence[Candidate], before: Sequence[Judged]
+) -> list[Judged]:
+    """Candidates, those first that take little time.
+
+    Args:
+        before: what was judged earlier in the round.
+    """
+    slow = [one for one in candidates if _adds_feedback(refits, one)]
+    judged = refits.judge([one for one in candidates if one not in slow])
+    there = [*before, *judged]
+    return judged + refits.judge([one for one in slow if not _is_needless(refits, one, there)])
+
+
+def _adds_feedback(refits: Refits, candidate: Candidate) -> bool:
+    """Whether a candidate adds functions in feedback, which take most of the time of a round."""
+    layers = len(refits.model.layers)
+    return any(model.has_feedback and len(model.layers) > layers for model in candidate[1])
+
+
+def _is_needless(refits: Refits, candidate: Candidate, judged: Sequence[Judged]) -> bool:
+    """Whether functions in feedback need not be tried.
+
+    The residual speaks more for something else, and with that forecasts of what was held out have
+    little else than noise for errors; with a relative noise alone. What functions would explain
+    beside it shows in the next round.
+    """
+    family = candidate[0].effect.family
+
+    def leaves_little(one: Judged) -> bool:
+        most = NOISE_ALONE if one.found.effect.family == family else LITTLE_ELSE
+        return one.tried.fit is not None and are_noise(one.tried.errors, one.tried.fit, most)
+
+    return _adds_feedback(refits, candidate) and any(
+        one.helps and one.found.q_value < candidate[0].q_value and leaves_little(one)
+        for one in judged
     )
 
 

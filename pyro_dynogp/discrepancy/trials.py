@@ -230,10 +230,10 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
         for place, model in enumerate(trial.models[2:], 2):
             if found:
                 leading, most, errors = max(found, key=lambda one: float(one[1].sum()))
-                if _are_noise(errors, leading):
+                if are_noise(errors, leading):
                     break
                 if _has_other_dynamics(model) and all(
-                    _are_noise(errors, fit, LITTLE_ELSE) for fit in (leading, trial.base)
+                    are_noise(errors, fit, LITTLE_ELSE) for fit in (leading, trial.base)
                 ):
                     continue
                 joined = [_back(one) for one in trial.models[:place] if _back(one) < _back(model)]
@@ -263,7 +263,7 @@ def _has_other_dynamics(model: Model) -> bool:
     return any(layer.real or layer.mostly_hidden for _, layer in model.dynamic)
 
 
-def _are_noise(errors: np.ndarray, fit: Fit, most: float = NOISE_ALONE) -> bool:
+def are_noise(errors: np.ndarray, fit: Fit, most: float = NOISE_ALONE) -> bool:
     """Whether errors (M, n_y) of forecasts are at most so often the noise that a fit has learnt."""
     if fit.system.noise.constant_sd is None:  # its size varies
         return False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,14 @@ from pyro_dynogp import effects
 from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.data.channels import Calendar, Delayed, ShiftedClock
 from pyro_dynogp.discrepancy import refits
-from pyro_dynogp.discrepancy.decision import _first_in_line, _specific, _too_special, confirm
+from pyro_dynogp.discrepancy.decision import (
+    _first_in_line,
+    _is_needless,
+    _judged,
+    _specific,
+    _too_special,
+    confirm,
+)
 from pyro_dynogp.discrepancy.judged import Judged, enough_samples, judge
 from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.discrepancy.trials import Tried
@@ -94,6 +102,49 @@ def test_of_effects_that_are_one_block_the_specific_one_gives_the_name_if_it_is_
 def test_a_special_case_gives_its_name_where_it_is_certain_or_alone(q, others, too_special) -> None:
     found = spoken_for(effects.Saturation(), 1e-3, q)
     assert _too_special(found, others, 0.05) == too_special
+
+
+NOISE = SimpleNamespace(
+    system=SimpleNamespace(noise=SimpleNamespace(constant_sd=1.0)), noise_sd=np.ones(1)
+)
+
+
+@pytest.mark.parametrize(
+    ("effect", "q", "gain", "error", "needed"),
+    [
+        (effects.ExtraInput(), 1e-5, 50.0, 1.4, False),
+        (effects.ExtraInput(), 1e-1, 50.0, 1.4, True),  # the residual speaks less for it
+        (effects.ExtraInput(), 1e-5, 0.0, 1.4, True),  # it does not help
+        (effects.ExtraInput(), 1e-5, 50.0, 1.6, True),  # it leaves more than noise
+        (effects.InputNonlinearity(), 1e-5, 50.0, 1.05, False),  # a relative
+        (effects.InputNonlinearity(), 1e-5, 50.0, 1.2, True),
+    ],
+)
+def test_functions_in_feedback_are_not_tried_beside_what_leaves_little_else_than_noise(
+    effect, q, gain, error, needed
+) -> None:
+    """They are judged last: of what takes less time any may be that."""
+    curve = spoken_for(effects.OutputNonlinearity(), 0.2, 0.3), (dgp.Wiener(1, pairs=1),)
+    back = spoken_for(effects.NonlinearFeedbackOfOutput(), 1e-3, 1e-2), (dgp.NonlinearFeedback(1),)
+    added = spoken_for(effect, q, q), (MODEL,)
+    judged = helping(effect, q, q, gain)
+    fitted = replace(judged.tried, errors=np.full((100, 1), error), fit=NOISE)
+    calls = []
+
+    def judge_all(candidates: list[Any]) -> list[Judged]:
+        calls.append([found.effect.name for found, _ in candidates])
+        return [replace(judged, found=f, tried=fitted) for f, _ in candidates if f is added[0]]
+
+    refitting: Any = SimpleNamespace(model=MODEL, judge=judge_all)
+    found = _judged(refitting, [back, added, curve], ())
+    assert [one.found for one in found] == [added[0]]
+    last = ["nonlinear feedback"] if needed else []
+    assert calls == [[effect.name, "output nonlinearity"], last]
+    # So it is with what was judged before, and all others are tried, whatever is there.
+    calls.clear()
+    _judged(refitting, [back, curve], found)
+    assert calls == [["output nonlinearity"], last]
+    assert [_is_needless(refitting, one, found) for one in (back, curve)] == [not needed, False]
 
 
 def judged_noise(gains: np.ndarray, errors: np.ndarray, before: np.ndarray) -> Judged:

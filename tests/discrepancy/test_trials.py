@@ -186,7 +186,7 @@ def refitted_by(monkeypatch, again, noise=False):
     monkeypatch.setattr(refits, "refit", again)
     monkeypatch.setattr(trials, "held_out_density", density)
     monkeypatch.setattr(trials, "scored", lambda fit, *_: (density(fit), np.zeros((9, 1))))
-    monkeypatch.setattr(trials, "_are_noise", lambda errors, fit, most=0.0: noise)
+    monkeypatch.setattr(trials, "are_noise", lambda errors, fit, most=0.0: noise)
     monkeypatch.setattr(trials, "certain", lambda gain, settings: gain.sum() > 1.0)
     monkeypatch.setattr(
         trials, "log_bayes_factor", lambda one, other: one.evidence - other.evidence
@@ -313,7 +313,7 @@ def test_later_variants_are_fitted_one_by_one_while_something_is_left(
 
     refitted_by(monkeypatch, again)
     monkeypatch.setattr(
-        trials, "_are_noise", lambda errors, fit, most=0.0: most == 0.0 and fit.level in noise
+        trials, "are_noise", lambda errors, fit, most=0.0: most == 0.0 and fit.level in noise
     )
     fold = np.arange(N) >= TRAINING
     trial = trials.Trial(models, record, (fold,), Made(plain, 0.0), 0, SETTINGS,
@@ -340,7 +340,7 @@ def test_other_dynamics_are_tried_where_more_than_a_little_is_left(record, monke
     def are_noise(errors, fit, most=0.0):
         return most == trials.LITTLE_ELSE and ("base" if fit is base else "fits") in little
 
-    monkeypatch.setattr(trials, "_are_noise", are_noise)
+    monkeypatch.setattr(trials, "are_noise", are_noise)
     fold = np.arange(N) >= TRAINING
     trials.run(trials.Trial(models, record, (fold,), base, 0, SETTINGS, compared="held out"))
     fitted = [one.model for one in made]
@@ -381,11 +381,11 @@ def test_errors_are_noise_up_to_a_tenth_more_in_every_output(ratios, noise):
     sd = np.array([0.5, 20.0])
     errors = np.resize([1.0, -1.0, np.nan], (30, 1)) * sd * ratios
     fit = SimpleNamespace(noise_sd=sd, system=SimpleNamespace(noise=SimpleNamespace(constant_sd=1)))
-    assert trials._are_noise(errors, fit) == noise
-    assert trials._are_noise(errors, fit, trials.LITTLE_ELSE)
-    assert not trials._are_noise(1.4 * errors, fit, trials.LITTLE_ELSE)
+    assert trials.are_noise(errors, fit) == noise
+    assert trials.are_noise(errors, fit, trials.LITTLE_ELSE)
+    assert not trials.are_noise(1.4 * errors, fit, trials.LITTLE_ELSE)
     fit.system.noise.constant_sd = None  # it varies, and has no one size
-    assert not trials._are_noise(errors, fit)
+    assert not trials.are_noise(errors, fit)
 
 
 @pytest.mark.parametrize(
