@@ -99,7 +99,7 @@ def confirm(
     done = [id(one.found) for one in judged]
     untried = [
         Attempt(number, one[0].evidence, one[0].q_value, "not tried",
-                LITTLE_LEFT if _is_needless(refits, one, judged) else CERTAIN_FIRST)
+                LITTLE_LEFT if one in sure or one in further else CERTAIN_FIRST)
         for one in candidates
         if id(one[0]) not in done
     ]  # fmt: skip
@@ -139,25 +139,23 @@ def confirm(
 def _judged(
     refits: Refits, candidates: Sequence[Candidate], before: Sequence[Judged]
 ) -> list[Judged]:
-    """Candidates, those first that take little time.
+    """Candidates, at last those that add functions in feedback: they take most of the time.
 
     Args:
         before: what was judged earlier in the round.
     """
-    slow = [one for one in candidates if _adds_feedback(refits, one)]
+    layers = len(refits.model.layers)
+    slow = [
+        one for one in candidates
+        if any(model.has_feedback and len(model.layers) > layers for model in one[1])
+    ]  # fmt: skip
     judged = refits.judge([one for one in candidates if one not in slow])
     there = [*before, *judged]
     return judged + refits.judge([one for one in slow if not _is_needless(refits, one, there)])
 
 
-def _adds_feedback(refits: Refits, candidate: Candidate) -> bool:
-    """Whether a candidate adds functions in feedback, which take most of the time of a round."""
-    layers = len(refits.model.layers)
-    return any(model.has_feedback and len(model.layers) > layers for model in candidate[1])
-
-
 def _is_needless(refits: Refits, candidate: Candidate, judged: Sequence[Judged]) -> bool:
-    """Whether functions in feedback need not be tried.
+    """Whether a candidate with functions in feedback need not be tried.
 
     The residual speaks more for something else, and with that forecasts of what was held out have
     little else than noise for errors; with a relative noise alone. What functions would explain
@@ -169,8 +167,11 @@ def _is_needless(refits: Refits, candidate: Candidate, judged: Sequence[Judged])
         most = NOISE_ALONE if one.found.effect.family == family else LITTLE_ELSE
         return one.tried.fit is not None and are_noise(one.tried.errors, one.tried.fit, most)
 
-    return _adds_feedback(refits, candidate) and any(
-        one.helps and one.found.q_value < candidate[0].q_value and leaves_little(one)
+    return any(
+        one.helps
+        and one.found.q_value < candidate[0].q_value
+        and leaves_little(one)
+        and refits.supported(refits.against_refit(one)).helps  # else nothing may be added
         for one in judged
     )
 

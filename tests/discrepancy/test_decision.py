@@ -113,6 +113,7 @@ NOISE = SimpleNamespace(
     ("effect", "q", "gain", "error", "needed"),
     [
         (effects.ExtraInput(), 1e-5, 50.0, 1.4, False),
+        (effects.LevelShift(), 1e-5, 50.0, 1.4, True),  # which evidence does not support, below
         (effects.ExtraInput(), 1e-1, 50.0, 1.4, True),  # the residual speaks less for it
         (effects.ExtraInput(), 1e-5, 0.0, 1.4, True),  # it does not help
         (effects.ExtraInput(), 1e-5, 50.0, 1.6, True),  # it leaves more than noise
@@ -135,7 +136,12 @@ def test_functions_in_feedback_are_not_tried_beside_what_leaves_little_else_than
         calls.append([found.effect.name for found, _ in candidates])
         return [replace(judged, found=f, tried=fitted) for f, _ in candidates if f is added[0]]
 
-    refitting: Any = SimpleNamespace(model=MODEL, judge=judge_all)
+    refitting: Any = SimpleNamespace(
+        model=MODEL,
+        judge=judge_all,
+        against_refit=lambda one: one,
+        supported=lambda one: replace(one, helps=one.found.effect.name != "level shift"),
+    )
     found = _judged(refitting, [back, added, curve], ())
     assert [one.found for one in found] == [added[0]]
     last = ["nonlinear feedback"] if needed else []
@@ -144,7 +150,7 @@ def test_functions_in_feedback_are_not_tried_beside_what_leaves_little_else_than
     calls.clear()
     _judged(refitting, [back, curve], found)
     assert calls == [["output nonlinearity"], last]
-    assert [_is_needless(refitting, one, found) for one in (back, curve)] == [not needed, False]
+    assert _is_needless(refitting, back, found) is not needed
 
 
 def judged_noise(gains: np.ndarray, errors: np.ndarray, before: np.ndarray) -> Judged:
