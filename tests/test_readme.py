@@ -32,6 +32,7 @@ def told():
         os.dup2(stream.fileno(), 2)
         try:
             with warnings.catch_warnings(record=True) as caught:
+                # More than the first of each line of code, which another test may have had.
                 warnings.simplefilter("always", UserWarning)
                 yield texts
         finally:

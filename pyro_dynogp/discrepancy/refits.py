@@ -128,7 +128,9 @@ class Refits:
         if not self.model.has_function or not self.judged(one.found, one.kind, one.tried).helps:
             return one  # the latter are confirmed together with another
         trial = self.trial((self.model,), one.kind, None, base=one.tried.fit)
-        tried = self.run({"": trial}, "refits without").get("")
+        key = (f"without {one.tried.model!r}", one.kind)
+        self._run_new({key: trial}, "refits without")
+        tried = self.results.get(key)
         if tried is None or tried.failure:
             return one
         again = judge(one.found, one.kind, one.tried, tried, self.number, self.settings)

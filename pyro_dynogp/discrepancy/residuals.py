@@ -74,9 +74,9 @@ def free_run_of(
         mean, component = _straight(run, fit, settings.draws, seed)
     else:
         mean, component = run(_spread(fit, settings.draws, seed))
-    if fit.model.has_feedback:  # what runs away is no spread of what was learnt
-        holds = ~leave_range(fit, component[:, begin:]).any(1)
-        component = component[holds] if holds.any() else component
+    # What runs away is no spread of what was learnt.
+    holds = ~leave_range(fit, component[:, begin:]).any(1)
+    component = component[holds] if holds.any() else component
     chosen = np.linspace(0, len(component) - 1, min(settings.draws, len(component))).astype(int)
     drawn = component[chosen]
     errors = one_step_errors(fit, record, held_out)
@@ -142,9 +142,9 @@ def residuals_of(
     driving = prepared.n_inputs - count_direct(fit.model.channels)
     y, mean = record.outputs[:, output].copy(), run.mean[:, output]
     y[: run.begin] = np.nan
-    if fit.model.has_feedback:  # what follows a run that leaves the range is no prediction
-        away = np.logical_or.accumulate(leave_range(fit, run.mean[None])[0])
-        y[away], mean = np.nan, np.where(away, float(fit.scaling.output_offset[output]), mean)
+    # What follows a run that leaves the range is no prediction.
+    away = np.logical_or.accumulate(leave_range(fit, run.mean[None])[0])
+    y[away], mean = np.nan, np.where(away, float(fit.scaling.output_offset[output]), mean)
     innovations = run.errors[:, output]
     # A sensor at its limit says nothing of the error there.
     stopped = at_limits(fit.model.layers, prepared)
@@ -202,7 +202,7 @@ def _free_run(
             mean[begin:] = found.mean
             component = np.concatenate([component[:few, :begin], runs[:few]], axis=1)
             before = np.concatenate([mean[None], component])[:, :begin]
-            if fit.model.has_feedback and leave_range(fit, before).any():
+            if leave_range(fit, before).any():
                 mean[:begin] = component[:, :begin] = predict(fit, past).mean
     return mean, component
 

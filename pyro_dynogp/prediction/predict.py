@@ -176,7 +176,12 @@ def _forward(
 
 
 def leave_range(fit: Fitted, runs: np.ndarray) -> np.ndarray:
-    """Where (S, n) free runs (S, n, n_y) leave the range of the training outputs far behind."""
+    """Where (S, n) free runs (S, n, n_y) leave the range of the training outputs far behind.
+
+    Nowhere without feedback, where runs are as large as inputs make them.
+    """
+    if not fit.model.has_feedback:
+        return np.zeros(runs.shape[:-1], dtype=bool)
     known = np.concatenate([one.outputs for one in fit.records])
     low, high = np.nanmin(known, 0), np.nanmax(known, 0)
     margin = FAR * (high - low)
@@ -186,8 +191,6 @@ def leave_range(fit: Fitted, runs: np.ndarray) -> np.ndarray:
 
 def _warn_of_divergence(fit: Fitted, found: Prediction) -> None:
     """Warn where free runs leave the range of the training outputs far behind."""
-    if not fit.model.has_feedback:
-        return
     runs = found.component_mean
     left = leave_range(fit, runs)
     if left.any():

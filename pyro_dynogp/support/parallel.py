@@ -27,7 +27,8 @@ from tqdm import tqdm
 from pyro_dynogp.support.errors import verify
 
 # joblib replaces a process that has grown by 300 MB, between two pieces of work of which none is
-# lost. Its warning of a leak would reach whoever fits a long record.
+# lost. Its warning of a leak would reach whoever fits a long record. It comes from a thread of
+# joblib, which no filter around a call reaches.
 warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
 
 # How often work is begun of which processes were killed.

@@ -106,6 +106,7 @@ def test_before_the_first_sample_that_counts_predictions_take_the_place_of_runs(
     found = residuals.free_run_of(fit, record, **given)
     ahead = fit.predict(record[:begin]).mean
     np.testing.assert_allclose(found.mean[:begin], ahead)
+    # All draws are alike; rounding is left of their mean, at outputs of 50 %.
     np.testing.assert_allclose(found.deviations[:, :begin], 0.0, atol=1e-10)
     np.testing.assert_allclose(found.mean[begin:], plain.mean[begin:])
 
