@@ -219,12 +219,12 @@ class SearchContext:
         noisy = self.refit(fit, with_process_noise(fit.model))
         return None if self.hiding(noisy, fit) else noisy
 
-    def confirm(self, chosen: Any, current: Fit, number: int) -> Confirmed:
-        """Refit what is chosen in a round, and judge it."""
+    def confirm(self, chosen: Any, current: Fit, number: int, weighed: bool = False) -> Confirmed:
+        """Refit what is chosen in a round, and judge it; see `decision.confirm`."""
         return confirm(
             chosen, current, self.data.known, self.held_out, number=number,
             seed=self.seed, level=self.level, settings=self.settings, workers=self.workers,
-            progress=self.progress, late=self.late,
+            progress=self.progress, late=self.late, weighed=weighed,
         )  # fmt: skip
 
     def beyond(self, residuals: Sequence[Residuals]) -> list[Beyond]:

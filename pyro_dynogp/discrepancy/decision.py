@@ -61,6 +61,7 @@ def confirm(
     workers: int | None = None,
     progress: bool = False,
     late: Callable[[], bool] | None = None,
+    weighed: bool = False,
 ) -> Confirmed:
     """Add each candidate alone, refit, and compare the densities of what was held out.
 
@@ -74,10 +75,12 @@ def confirm(
         number: of the round. seed: of refits. level: of the tests. settings: thresholds.
         late: says whether the time limit has passed; None for none. A round that it cuts short adds
             nothing: what was refitted is not compared with all others.
+        weighed: whether there must be evidence for whatever is added, in all known data: no test
+            says for certain that anything is missing.
     """
     begin = latest([one.evidence for one, _ in candidates if one.effect.localised], record)
     refits = Refits(
-        current, record, held_out, number, seed, settings, workers, progress, late, begin
+        current, record, held_out, number, seed, settings, workers, progress, late, begin, weighed
     )
     structure = [one for one in candidates if kind_of(one[0])[1] == "forecast"]
     sure = [one for one in structure if one[0].q_value <= level]

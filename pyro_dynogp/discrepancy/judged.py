@@ -22,6 +22,8 @@ Kind = tuple[Where, Score]
 SPREAD: Kind = ("spread", "forecast")
 # How a reason ends that asks for more samples.
 MORE = "would settle it"
+# So many times as many samples are not called more of them.
+MOST_MORE = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,14 +98,18 @@ def enough_samples(gain: float, error: float, count: int, settings: LoopSettings
 
     Nearly is from `settings.nearly` block standard errors on. A gain grows like the number of
     samples and its error like the square root of it, so that gain / error = c takes
-    (c error / gain)^2 times as many; rounded up to two digits.
+    (c error / gain)^2 times as many; rounded up to two digits. What takes more than `MOST_MORE`
+    times as many is no gain.
 
     Args:
         gain, error: in log density of `count` samples, with its block standard error [nats].
     """
     if not settings.nearly * error <= gain <= settings.standard_errors * error or gain <= 0.0:
         return 0
-    wanted = count * max((settings.standard_errors * error / gain) ** 2, settings.gain / gain)
+    times = max((settings.standard_errors * error / gain) ** 2, settings.gain / gain)
+    if times > MOST_MORE:
+        return 0
+    wanted = count * times
     digit = 10 ** max(int(np.log10(wanted)) - 1, 0)
     return int(np.ceil(wanted / digit)) * digit
 

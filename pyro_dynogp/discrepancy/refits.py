@@ -35,6 +35,7 @@ class Refits:
         record: blocks A and B. held_out: (n,) True in B.
         number: of the round. seed, settings, workers, progress, late: as of `confirm`.
         begin: sample where the last of the candidates of one instant happens, 0 for none.
+        weighed: as of `confirm`.
         results: of the trials so far, by the models and how they are scored.
         evidences: of models that are fitted to all known data, by model and samples [nats].
         early: whether the time limit was passed with trials to go.
@@ -50,6 +51,7 @@ class Refits:
     progress: bool
     late: Callable[[], bool] | None = None
     begin: int = 0
+    weighed: bool = False
     results: dict[tuple[str, Kind], Tried] = field(default_factory=dict)
     evidences: dict[tuple[str, int], float] = field(default_factory=dict)
     early: bool = False
@@ -147,9 +149,10 @@ class Refits:
         Where poles, gains or levels were badly known before block B, what is wrong there may look
         like a step or a drift, and the model with that forecasts better. What parameters learn from
         B is no effect. Evidence is Laplace's. (Effects of inputs are looked for in all data, and
-        need none.)
+        need none where tests are certain that something is missing.)
         """
-        if one.found.effect.acts_on == "inputs" or one.tried.fit is None or not one.helps:
+        known = one.found.effect.acts_on == "inputs" and not self.weighed
+        if known or one.tried.fit is None or not one.helps:
             return one
         return one if self.evidence(one) > VERY_STRONG else self._weighed(one, False)
 
@@ -277,14 +280,17 @@ class Refits:
         def again(one: Judged) -> Judged:
             two = self.judged(one.found, SPREAD, spread[repr(one.tried.model)])
             reason = f"{one.attempt.reason}; on blocks of the whole record {two.attempt.reason}"
-            kept = two if two.helps else one
+            # Evidence of training data is no match for forecasts that are certainly worse.
+            kept = two if two.helps else replace(one, harms=two.harms)
             return replace(kept, attempt=replace(kept.attempt, reason=reason))
 
         return [again(one) if one in unsettled else one for one in judged]
 
     def _may_be_weighed(self, one: Judged) -> bool:
         """Whether a candidate nearly helps, or gains and adds parametric functions in feedback."""
-        gains = one.attempt.gain > 0.0 and not one.harms
+        if one.harms:
+            return False
+        gains = one.attempt.gain > 0.0
         return one.attempt.decision == "nearly" or (gains and self._adds_forms(one))
 
     def _adds_forms(self, one: Judged) -> bool:

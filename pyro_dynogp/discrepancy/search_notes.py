@@ -1,4 +1,4 @@
-"""What a search says of itself: that time ended it, and what process noise hid."""
+"""What a search says of itself: that time ended it, what process noise hid, what forecasts miss."""
 
 from __future__ import annotations
 
@@ -47,3 +47,16 @@ def said_of_hiding(course: SearchState) -> list[str]:
             "has it again: there it costs nothing." if back else "does without it."
         )
     return [f"The model as given {course.hidden}: such noise can hide what is missing. {done}"]
+
+
+def said_of_misses(course: SearchState) -> list[str]:
+    """That forecasts miss by far more than the noise, where no test tells why."""
+    if not course.misses:
+        return []
+    why = "One step ahead the model takes it for process noise. "
+    if not has_process_noise(course.current.model):
+        why = ""
+    return [
+        f"{course.misses} {why}No residual test is certain of an effect there, and none that was "
+        "refitted helps for certain."
+    ]

@@ -11,6 +11,7 @@ from pyro_dynogp.discrepancy.context import Left, SearchContext, Stopwatch, Test
 from pyro_dynogp.discrepancy.data_faults import spikes_of
 from pyro_dynogp.discrepancy.decision import Confirmed
 from pyro_dynogp.discrepancy.elimination import Added, is_superfluous, withdrawn, without
+from pyro_dynogp.discrepancy.forecast_misses import forecast_misses
 from pyro_dynogp.discrepancy.result import Attempt, EffectTest, Outcome
 from pyro_dynogp.discrepancy.search import Candidate, Found, candidates_of, extended_by
 from pyro_dynogp.effects.base import OUTSIDE
@@ -52,6 +53,7 @@ class SearchState:
         attempts: what was tried. tests: all tests, whatever came of them.
         reported: what no block mends, by the last tests.
         rest: what is left by the last tests. notes: what else there is to say.
+        misses: in words, that forecasts miss by far more than the noise, where tests say nothing.
         early: whether the time limit was passed before the search came to its end.
         left_without: what is left without process noise, where rounds began again with it.
         looked: what the last tests saw; None where the model has changed since.
@@ -73,6 +75,7 @@ class SearchState:
     tests: list[EffectTest] = field(default_factory=list)
     reported: list[Found] = field(default_factory=list)
     rest: Left = field(default_factory=Left)
+    misses: str = ""
     notes: list[str] = field(default_factory=list)
     early: bool = False
     left_without: tuple[str, ...] = ()
@@ -97,7 +100,10 @@ class SearchState:
             ]
         rounds, chosen = self.rounds, self._chosen(looked)
         attempts = self._untried(looked.found, chosen, OTHERS)
-        confirmed = rounds.confirm(chosen, self.current, self.number) if chosen else None
+        confirmed = None
+        if chosen:
+            weighed = not self.rest.said
+            confirmed = rounds.confirm(chosen, self.current, self.number, weighed)
         if confirmed is not None:
             self.watch.stop("refits")
             attempts += confirmed.attempts
@@ -153,7 +159,10 @@ class SearchState:
         self.reported = [
             f for f in looked.found if not f.effect.added and f.q_value <= self.rounds.gate
         ]
-        self.rest = self.rounds.left(looked)
+        rounds = self.rounds
+        self.rest = rounds.left(looked)
+        if not self.rest.said:
+            self.misses = forecast_misses(self.current, rounds.data.known, rounds.held_out)
         self.looked = looked
         self.watch.stop("residual tests")
         return looked
@@ -223,9 +232,9 @@ class SearchState:
         return SET not in where and where.get("channel") in points
 
     def _chosen(self, looked: Tested) -> list[Candidate]:
-        """Effects that are worth a refit, where anything is left."""
+        """Effects that are worth a refit, where anything is left, or forecasts miss."""
         rounds = self.rounds
-        if not self.rest.said:
+        if not (self.rest.said or self.misses):
             return []
         open_loop = [f for f in looked.found if not (self._is_fed_back(f) or self._is_set_point(f))]
         return candidates_of(
@@ -238,7 +247,7 @@ class SearchState:
         decided: dict[int, Outcome] = {id(one.evidence): one.decision for one in attempts}
         for f in found:
             one, level = f.evidence, self.rounds.level
-            passed = bool(self.rest.said) and one.p_value <= level
+            passed = bool(self.rest.said or self.misses) and one.p_value <= level
             otherwise: Outcome = "not tried" if passed else "not significant"
             decision: Outcome = decided.get(id(one), otherwise)
             test = EffectTest(
@@ -319,4 +328,4 @@ class SearchState:
 
     def _go_on_from(self, fit: Fit) -> None:
         self.current, self.model = fit, replace(fit.model, scaling=None)
-        self.rest, self.looked = Left(), None  # they were of another model
+        self.rest, self.misses, self.looked = Left(), "", None  # they were of another model

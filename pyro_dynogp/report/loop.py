@@ -11,7 +11,7 @@ from pyro_dynogp.data.records import one_record
 from pyro_dynogp.discrepancy.blocks import Blocks, blocks_of
 from pyro_dynogp.discrepancy.context import SearchContext, Stopwatch
 from pyro_dynogp.discrepancy.held_out import without
-from pyro_dynogp.discrepancy.search_notes import said_of_hiding, said_of_time
+from pyro_dynogp.discrepancy.search_notes import said_of_hiding, said_of_misses, said_of_time
 from pyro_dynogp.discrepancy.state import SearchState
 from pyro_dynogp.effects import CATALOGUE, Effect
 from pyro_dynogp.fitting import fit as fit_model
@@ -129,6 +129,7 @@ def close_loop(
         *course.notes,
         *course.rest.untested,
         *said_of_hiding(course),
+        *said_of_misses(course),
         *said_of_time(course),
     ]
     # The same samples for all, so that they can be compared.

@@ -1,4 +1,7 @@
-"""Run the benchmarks and write one results page: ``make benchmark``, or with names of parts."""
+"""Run the benchmarks and write one results page: ``make benchmark``, or with names of parts.
+
+Options after the name of a part that has some are its own: `naming --seeds 0-1 --kinds motor`.
+"""
 
 from __future__ import annotations
 
@@ -79,8 +82,13 @@ PARTS = {
     "package": package.run,
 }
 
+# Parts that read options of their own.
+WITH_OPTIONS = {"naming": naming.main}
+
 
 def main(names: list[str]) -> int:
+    if len(names) > 1 and names[0] in WITH_OPTIONS and names[1].startswith("-"):
+        return WITH_OPTIONS[names[0]](names[1:])
     unknown = set(names) - set(PARTS)
     if unknown:
         print(f"Unknown parts {sorted(unknown)}; there are {', '.join(PARTS)}.", file=sys.stderr)

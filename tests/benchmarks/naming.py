@@ -6,7 +6,7 @@ defaults. Other tools look at the same residuals (`naming_peers`). The oracle is
 looks for the planted effects alone; what it finds more is the cost of search.
 
     python -m tests.benchmarks naming
-    python -m tests.benchmarks.naming --seeds 0-1 --kinds motor,tanks --strengths strong
+    python -m tests.benchmarks naming --seeds 0-1 --kinds motor,tanks --strengths strong
 
 The variables NAMING_SEEDS ("0-4"), NAMING_KINDS, NAMING_STRENGTHS, NAMING_GROUPS and
 NAMING_WORKERS choose in the first form. Every case is a line of a file that is kept with the
@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 import time
 import traceback
 import warnings
@@ -219,7 +218,7 @@ def run(
 
 def main(arguments: Sequence[str]) -> int:
     """Run a part of the study and print the tables."""
-    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.naming")
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks naming")
     names = ("seeds", "kinds", "effects", "strengths", "groups")
     for name in names:
         parser.add_argument(f"--{name}")
@@ -234,10 +233,3 @@ def main(arguments: Sequence[str]) -> int:
     choice = choice_of(words, given.split, given.oracle)
     print(run(given.kept, choice, given.workers, given.seconds, given.kept, given.again))
     return 0
-
-
-if __name__ == "__main__":
-    # By its name: other processes import what they are sent from there.
-    from tests.benchmarks import naming
-
-    raise SystemExit(naming.main(sys.argv[1:]))

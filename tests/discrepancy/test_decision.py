@@ -199,6 +199,8 @@ def test_structure_that_costs_the_forecasts_does_not_help() -> None:
         (1.6, 1.0, 250),  # by the least gain: 100 * 4 / 1.6, and by its error 156
         (-15.1, 10.0, 0),
         (0.0, 0.0, 0),
+        (0.41, 0.25, 980),
+        (0.39, 0.25, 0),  # more than ten times as many: 100 * 4 / 0.39
     ],
 )
 def test_how_many_samples_would_settle_a_gain_that_is_nearly_enough(gain, error, wanted) -> None:

@@ -9,6 +9,7 @@ import pytest
 import pyro_dynogp as dgp
 from pyro_dynogp.discrepancy.result import KEPT
 from pyro_dynogp.effects.base import OUTSIDE
+from tests.benchmarks import __main__ as benchmarks
 from tests.benchmarks import naming
 from tests.benchmarks.kept_rows import read_rows
 from tests.benchmarks.naming_cases import KEY, NULLS, Case, Choice, cases_of, choice_of, chosen_by
@@ -298,3 +299,10 @@ def test_the_oracle_looks_for_what_is_planted(monkeypatch):
     assert found["oracle"] is True
     assert [one.name for one in asked["effects"]] == found["accepted"][effect]
     assert asked["candidates"] == [found["true_channel"]]
+
+
+def test_the_command_of_all_benchmarks_reads_options_of_the_study(tmp_path, capsys):
+    given = ["--seeds", "3", "--kinds", "motor", "--groups", "single", "--strengths", "weak"]
+    given += ["--effects", "dead zone", "--seconds", "-1", "--kept", str(tmp_path)]
+    assert benchmarks.main(["naming", *given]) == 0
+    assert capsys.readouterr().out.startswith("0 of the 1 cases asked for are there.")

@@ -129,6 +129,8 @@ def test_evidence_has_to_be_very_strong(
     scored, one = candidate(late_input(0.0), effect)
     monkeypatch.setattr(module, "log_evidence_of", lambda fit: gain * len(fit.model.channels))
     assert scored.supported(one).helps is helps
+    scored.weighed = True  # where no test is certain, evidence has to be very strong for all
+    assert scored.supported(one).helps is (gain > VERY_STRONG)
     unfitted = replace(one, tried=replace(one.tried, fit=None))
     assert scored.supported(unfitted) is unfitted
     loser = replace(one, helps=False)

@@ -44,8 +44,9 @@ def modes():
     }
 
 
-def test_with_functions_runs_are_linear_around_the_mode(modes, monkeypatch):
-    """Draws of a model with functions cost a climb and a Hessian."""
+@pytest.mark.parametrize("name", ["feedback", "linear"])
+def test_runs_are_linear_around_the_mode(modes, name, monkeypatch):
+    """Draws cost a climb and a Hessian, and are no posterior along ridges."""
 
     def no_draws(*args, **options):
         raise AssertionError
@@ -53,9 +54,29 @@ def test_with_functions_runs_are_linear_around_the_mode(modes, monkeypatch):
     record, fits = modes
     monkeypatch.setattr(residuals, "draws_of", no_draws)
     settings = LoopSettings()
-    found = residuals.residuals_of(fits["feedback"], record, settings=settings)
+    found = residuals.residuals_of(fits[name], record, settings=settings)
     assert found.deviations.shape == (settings.draws, len(record))
     assert (found.deviations.std(0) > 0.0).all()
+
+
+def test_more_poles_than_a_plant_has_spread_runs_by_less_than_the_noise():
+    """Of p numbers n samples leave sqrt(p / n) of the noise; draws of the normal left 18 times that.
+
+    A tank of one pole, fitted with two pairs: what tests take for the parameters' uncertainty is
+    added to each replicate, and hid effects of four times the noise.
+    """
+    rng, n, sd = np.random.default_rng(3), 300, 0.1
+    u = np.repeat(rng.standard_normal(n // 10), 10)
+    y = lfilter([0.0, 0.05], [1.0, -0.95], u) + sd * rng.standard_normal(n)
+    record = dgp.Record(np.arange(float(n)), u, y)
+    model = dgp.LinearDynamicGP(1, pairs=2, process_noise=False)
+    fit = dgp.fit(model, record, method="map", restarts=2, workers=1, progress=False)
+    run = residuals.free_run_of(
+        fit, record, held_out=np.zeros(n, dtype=bool), seed=0, settings=LoopSettings()
+    )
+    spread = np.sqrt(np.square(run.deviations[:, run.begin :]).mean())
+    numbers = sum(value.numel() for value in fit.mode.values())
+    assert 0.3 < spread / (sd * np.sqrt(numbers / n)) < 1.5
 
 
 def test_parameters_of_linear_models_are_drawn(modes):

@@ -99,6 +99,30 @@ def test_what_does_not_gain_there_either_stays_as_it_was() -> None:
         assert "on blocks of the whole record" in settled.attempt.reason
 
 
+@pytest.mark.parametrize(("worse", "harms"), [(1.0, False), (2.0, True)])
+def test_forecasts_of_the_whole_record_that_are_worse_count_against(
+    monkeypatch: pytest.MonkeyPatch, worse: float, harms: bool
+) -> None:
+    """Then no evidence of training data is a match for them."""
+    one, errors = candidate(INPUT, 19.0, 10.0), np.resize([1.0, -1.0], SAMPLES)[:, None]
+    scored = refits(replace(HARDLY, errors=worse * errors))
+    base = replace(tried(0.0, 1e-9), errors=errors)
+    run = scored.run
+    monkeypatch.setattr(
+        scored, "run", lambda tasks, label: run(tasks, label) | {("", SPREAD): base}
+    )
+    (settled,) = scored.settled([one], 0.05)
+    assert settled.harms is harms
+    assert not settled.helps
+    assert settled.attempt.decision == "nearly"
+    monkeypatch.setattr(scored, "evidence", lambda one: VERY_STRONG + 1.0)
+    settled = replace(settled, tried=replace(settled.tried, fit=cast(Any, object())))
+    monkeypatch.setattr(scored, "_adds_forms", lambda one: True)
+    gaining = replace(settled, attempt=replace(settled.attempt, decision="rejected"))
+    assert scored.by_evidence([gaining], 0.05)[0].helps is not harms
+    assert scored.by_evidence([settled], 0.05)[0].helps is not harms
+
+
 def test_what_costs_forecasts_is_not_settled() -> None:
     scored = refits(WELL)
     one = candidate(INPUT, 19.0, 10.0, worse=2.0)

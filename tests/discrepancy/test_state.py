@@ -115,7 +115,7 @@ def test_what_cannot_be_tested_is_said_and_ends_nothing(rounds):
             level=0.05, gate=rounds.gate,
             data=SimpleNamespace(known=SimpleNamespace(output_names=("few", "y"))),
         ),
-        rest=left, attempts=[], tests=[], number=1,
+        rest=left, misses="", attempts=[], tests=[], number=1,
     )  # fmt: skip
     SearchState._list(state, [], [])
     assert [test.output for test in state.tests] == ["y"]  # no p-value where there was no test
