@@ -100,10 +100,8 @@ class SearchState:
             ]
         rounds, chosen = self.rounds, self._chosen(looked)
         attempts = self._untried(looked.found, chosen, OTHERS)
-        confirmed = None
-        if chosen:
-            weighed = not self.rest.said
-            confirmed = rounds.confirm(chosen, self.current, self.number, weighed)
+        given = chosen, self.current, self.number, not self.rest.said
+        confirmed = rounds.confirm(*given) if chosen else None
         if confirmed is not None:
             self.watch.stop("refits")
             attempts += confirmed.attempts
