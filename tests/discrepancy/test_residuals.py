@@ -60,7 +60,7 @@ def test_runs_are_linear_around_the_mode(modes, name, monkeypatch):
 
 
 def test_more_poles_than_a_plant_has_spread_runs_by_less_than_the_noise():
-    """Of p numbers n samples leave sqrt(p / n) of the noise; draws of the normal left 18 times that.
+    """Of p numbers n samples leave sqrt(p / n) of the noise; normal draws left 18 times that.
 
     A tank of one pole, fitted with two pairs: what tests take for the parameters' uncertainty is
     added to each replicate, and hid effects of four times the noise.
