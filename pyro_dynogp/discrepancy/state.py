@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from pyro_dynogp.fitting import Fit
 
 FED_BACK = "inputs are under feedback, for which the residual speaks more clearly"
-OTHERS = "others are more probable, or no block of the model stands for it"
+OTHERS = "others are more probable"
+NO_BLOCK = "no block of the model stands for it"
 ANY = "any structure"
 SET_POINT = "it is the set point of a controller, and acts through the input alone"
 OVER = "the most effects that may be added are added"
@@ -92,13 +93,11 @@ class SearchState:
     def go_round(self) -> bool:
         """Look, try what the residual speaks for, and add what helps; whether to go on."""
         self.number += 1
-        looked = self.look()
+        looked, rounds = self.look(), self.rounds
         if self.number == 1:
-            self.notes += [
-                *spikes_of(looked.residuals, self.rounds.data.known, self.rounds.settings),
-                *looked.notes,
-            ]
-        rounds, chosen = self.rounds, self._chosen(looked)
+            self.notes += spikes_of(looked.residuals, rounds.data.known, rounds.settings)
+            self.notes += looked.notes
+        chosen = self._chosen(looked)
         attempts = self._untried(looked.found, chosen, OTHERS)
         given = chosen, self.current, self.number, not self.rest.said
         confirmed = rounds.confirm(*given) if chosen else None
@@ -270,8 +269,9 @@ class SearchState:
         for f in found:
             if f.q_value > self.rounds.level or any(f is one for one in tried):
                 continue
-            refused = extended_by(f, self.model, self.rounds.data.known)[1]
-            attempt = Attempt(self.number, f.evidence, f.q_value, "not tried", refused or why)
+            variants, refused = extended_by(f, self.model, self.rounds.data.known)
+            reason = refused or (why if variants else NO_BLOCK)
+            attempt = Attempt(self.number, f.evidence, f.q_value, "not tried", reason)
             if not f.effect.added:
                 attempt = replace(attempt, decision="reported", reason="is reported, not added")
             elif self._is_set_point(f):

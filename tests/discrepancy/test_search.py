@@ -293,6 +293,13 @@ def test_an_effect_that_the_model_cannot_have_is_no_candidate_and_says_why():
         number=2, model=model, rounds=SimpleNamespace(level=0.05, data=data),
         _is_fed_back=lambda found: False,
     )  # fmt: skip
-    attempts = SearchState._untried(course, [refused, fine], [], "others come first")
-    assert [one.reason for one in attempts] == [why, "others come first"]
-    assert [one.decision for one in attempts] == ["not tried", "not tried"]
+
+    class WithoutBlock(Certain):
+        def extend(self, model, evidence, record):
+            return []
+
+    found = [refused, fine, Found(*speaking(WithoutBlock("hysteresis", 1e-3), 1e-3), 1e-3)]
+    attempts = SearchState._untried(course, found, [], "others come first")
+    none = "no block of the model stands for it"
+    assert [one.reason for one in attempts] == [why, "others come first", none]
+    assert [one.decision for one in attempts] == ["not tried"] * 3
