@@ -46,7 +46,7 @@ LINES = 31_500
 # lines), and functions in feedback that are not tried beside what leaves noise
 # alone (50 lines), and forecasts that miss where no test is certain (70 lines).
 # To shrink.
-LINES_TODAY = 55_715
+LINES_TODAY = 55_720
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

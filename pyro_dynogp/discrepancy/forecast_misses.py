@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pyro_dynogp.data.channels import count_direct
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.held_out import forecast_errors
 from pyro_dynogp.discrepancy.trials import LITTLE_ELSE
@@ -26,6 +27,9 @@ def forecast_misses(fit: Fit, record: Record, held_out: np.ndarray) -> str:
     """
     noise = fit.system.noise
     if not held_out.any() or noise.constant_sd is None:  # its size varies
+        return ""
+    prepared = fit.model.check(record)[0]
+    if prepared.n_inputs == count_direct(fit.model.channels):  # noise alone drives it
         return ""
     errors = forecast_errors(fit, record, held_out)[0][held_out]
     rmse = np.sqrt(np.nanmean(np.square(errors), axis=0))

@@ -10,6 +10,7 @@ import pytest
 
 import pyro_dynogp as dgp
 from pyro_dynogp import effects
+from pyro_dynogp.data.channels import Step
 from pyro_dynogp.discrepancy import forecast_misses as module
 from pyro_dynogp.discrepancy import state
 from pyro_dynogp.discrepancy.context import Left, Tested
@@ -25,7 +26,12 @@ MODEL = dgp.LinearDynamicGP(1, pairs=1)
 
 
 def missed(
-    monkeypatch: pytest.MonkeyPatch, times: float, varies: bool = False, held_out: bool = True
+    monkeypatch: pytest.MonkeyPatch,
+    times: float,
+    varies: bool = False,
+    held_out: bool = True,
+    inputs: int = 1,
+    channels: tuple[Any, ...] = (),
 ) -> str:
     """Of two outputs with noise 0.5; errors of the second are so many times as large."""
     errors = 0.5 * np.column_stack([np.ones(20), times * np.ones(20)])
@@ -33,7 +39,9 @@ def missed(
     monkeypatch.setattr(module, "forecast_errors", lambda *given: (errors, errors))
     sd = None if varies else np.full(2, 0.5)
     noise = SimpleNamespace(constant_sd=sd)
-    fit: Any = SimpleNamespace(noise_sd=sd, system=SimpleNamespace(noise=noise))
+    seen = SimpleNamespace(n_inputs=inputs)
+    model = SimpleNamespace(check=lambda record: (seen,), channels=channels)
+    fit: Any = SimpleNamespace(noise_sd=sd, system=SimpleNamespace(noise=noise), model=model)
     record: Any = SimpleNamespace(output_names=("a", "b"))
     there = np.zeros(20, dtype=bool)
     there[10:] = held_out
@@ -50,11 +58,14 @@ def test_errors_far_beyond_the_noise_are_said(monkeypatch: pytest.MonkeyPatch) -
     assert "('b' inf for 0.5)" in missed(monkeypatch, np.inf)
 
 
-def test_nothing_is_said_of_noise_that_varies_or_where_nothing_is_held_out(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(
+    "where", [{"varies": True}, {"held_out": False}, {"channels": (Step(3.0),)}]
+)
+def test_nothing_is_said_where_forecasts_are_not_measured_by_noise(
+    monkeypatch: pytest.MonkeyPatch, where: dict[str, Any]
 ) -> None:
-    assert missed(monkeypatch, 3.0, varies=True) == ""
-    assert missed(monkeypatch, 3.0, held_out=False) == ""
+    assert missed(monkeypatch, 3.0) != ""
+    assert missed(monkeypatch, 3.0, **where) == ""
 
 
 @pytest.mark.parametrize(
