@@ -44,9 +44,10 @@ LINES = 31_500
 # in feedback (330 lines), and models of one form and last fits in the units of block A (80 lines),
 # and first states that are estimated once (60 lines), and candidates that diverge unheard (60
 # lines), and functions in feedback that are not tried beside what leaves noise
-# alone (50 lines), and forecasts that miss where no test is certain (70 lines).
+# alone (50 lines), and forecasts that miss where no test is certain (80 lines), and the uncertainty
+# of parameters beside coloured errors (70 lines).
 # To shrink.
-LINES_TODAY = 55_720
+LINES_TODAY = 55_790
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

@@ -15,7 +15,6 @@ from pyro_dynogp.criticism.finding import apart
 from pyro_dynogp.inference.cascade_coordinates import StraightPotential
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.importance_sampling import sample_around, samples_of, systematic
-from pyro_dynogp.inference.laplace import fisher_normal
 from pyro_dynogp.inference.laplace import laplace as laplace_of
 from pyro_dynogp.inference.log_joint import log_joint_of
 from pyro_dynogp.inference.methods.annealed import Joint, anneal
@@ -145,23 +144,6 @@ def normal_of(fit: Fitted) -> Mixture:
     if isinstance(fit.posterior, Mixture) and fit.posterior.sites and not fit.posterior.points:
         return fit.posterior
     return laplace(fit, fit.mode)
-
-
-def normal_near(fit: Fitted, share: float = 1.0) -> Mixture:
-    """Normal around the mode of a fit, by the Fisher matrix of one-step predictions.
-
-    A Hessian of a model with static functions takes hundreds of gradients, and the climb to the
-    mode that Laplace's approximation is around as many; the Fisher matrix takes a few. Without one
-    (a last layer with limits, a mode at an edge) it is Laplace's approximation.
-
-    Args:
-        fit: a posterior mode. share: of the posterior's standard deviations.
-    """
-    with seeded(fit.seed):
-        potential = Potential(fit.model.collapsed, (_data(fit),), fit.mode)
-        near = fisher_normal(potential, fit.mode, steps=0)
-    root = laplace(fit, fit.mode).scale_tril[0] if near is None else torch.as_tensor(near[1])
-    return Mixture.normal(potential, potential.pack(fit.mode), share * root)
 
 
 def carried(

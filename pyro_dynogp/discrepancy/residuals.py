@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pyro_dynogp.criticism.posterior_draws import draws_of, normal_near
+from pyro_dynogp.criticism.posterior_draws import draws_of
 from pyro_dynogp.data.channels import count_direct
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.held_out_errors import one_step_errors
+from pyro_dynogp.discrepancy.parameter_spread import normal_near
 from pyro_dynogp.lti.semiseparable import NotPositiveDefiniteError
 from pyro_dynogp.models.delays import longest_delay, unknown_beginning
 from pyro_dynogp.models.limits import at_limits
@@ -71,7 +72,7 @@ def free_run_of(
     if fit.method != "map":
         mean, component = run(fit)
     else:
-        mean, component = _straight(run, fit, settings.draws, seed)
+        mean, component = _straight(run, fit, settings, seed)
     # What runs away is no spread of what was learnt.
     holds = ~leave_range(fit, component[:, begin:]).any(1)
     component = component[holds] if holds.any() else component
@@ -82,7 +83,7 @@ def free_run_of(
 
 
 def _straight(
-    run: Callable[[Fit], tuple[np.ndarray, np.ndarray]], fit: Fit, count: int, seed: int
+    run: Callable[[Fit], tuple[np.ndarray, np.ndarray]], fit: Fit, settings: LoopSettings, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean and draws of a free run whose change by the parameters is taken as linear.
 
@@ -93,8 +94,9 @@ def _straight(
     noise of 0.09; 0.035). Each draw has a first state of its own, the same at the mode and near it.
     Where the filter cannot be run at some of them, all are draws as they are.
     """
+    count = settings.draws
     mean, still = run(_at_mode(fit, count))
-    _, moved = run(fit.with_draws(normal_near(fit, NEAR).draws(count, seed).values))
+    _, moved = run(fit.with_draws(normal_near(fit, settings, NEAR).draws(count, seed).values))
     if len(still) != len(moved):  # the filter fails at some of them
         return run(_spread(fit, count, seed))
     return mean, still + (moved - still) / NEAR

@@ -51,7 +51,7 @@ def fisher_normal(
     None where there is no such matrix: where the last layer has limits, of models that are not this
     library's, at an edge of what can be evaluated.
     """
-    innovations = _innovations(potential)
+    innovations = innovations_of(potential)
     if innovations is None:
         return None
     z = climb(innovations, potential.pack(values).numpy(), steps)[0]
@@ -64,7 +64,7 @@ def fisher_root(potential: Potential, values: Mapping[str, Tensor]) -> np.ndarra
 
     None where predictions next to them are not finite, and as of `fisher_normal`.
     """
-    innovations = _innovations(potential)
+    innovations = innovations_of(potential)
     return None if innovations is None else _root_at(innovations, potential.pack(values).numpy())
 
 
@@ -73,7 +73,7 @@ def _root_at(innovations: Innovations, z: np.ndarray) -> np.ndarray | None:
     return None if here is None else bounded_root(here.fisher + here.prior)
 
 
-def _innovations(potential: Potential) -> Innovations | None:
+def innovations_of(potential: Potential) -> Innovations | None:
     """Of the unconstrained vector's density, where the model has such."""
     density = potential.log_density
     if not isinstance(density, Direct) or not has_innovations(density.model):
@@ -90,7 +90,7 @@ def log_evidence(potential: Potential, values: Mapping[str, Tensor]) -> float:
     static functions it is the Fisher matrix's, where there is one.
     """
     z = potential.pack(values).numpy()
-    innovations = _innovations(potential)
+    innovations = innovations_of(potential)
     here = innovations.local(z) if innovations and innovations.has_functions else None
     if here is None:
         energy = potential.value_and_gradient(z, jacobian=True)[0]

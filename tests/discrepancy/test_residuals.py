@@ -7,8 +7,8 @@ from scipy.signal import lfilter
 
 import pyro_dynogp as dgp
 from pyro_dynogp import effects
-from pyro_dynogp.criticism import posterior_draws
 from pyro_dynogp.discrepancy import residuals
+from pyro_dynogp.discrepancy.parameter_spread import normal_near
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.mode import at_optimum
 from pyro_dynogp.inference.optimise.maximum import maximise
@@ -235,8 +235,9 @@ def test_runs_of_functions_are_linear_in_the_parameters(feedback):
     def run(some):
         return fit.simulate(record, process_noise=False, seed=0).mean, runs(some)
 
-    found = residuals._straight(run, fit, 3000, 1)[1].var(0)
-    normal = posterior_draws.normal_near(fit)
+    settings = LoopSettings(draws=3000)
+    found = residuals._straight(run, fit, settings, 1)[1].var(0)
+    normal = normal_near(fit, settings)
     z, root = normal.loc[0], normal.scale_tril[0].numpy()
 
     def around(step):
@@ -257,19 +258,6 @@ def test_runs_of_functions_are_linear_in_the_parameters(feedback):
     assert found[late].mean() < 0.02**2
     loose = fit.with_draws(normal.draws(200, 0).values)
     assert runs(loose).var(0)[late].mean() > 2.0 * found[late].mean()
-
-
-def test_the_normal_near_a_mode_is_laplaces_where_parameters_are_well_known(sensor):
-    record, _ = sensor
-    model = dgp.LinearDynamicGP(1, pairs=1, process_noise=False)
-    y = lfilter([0.0, 0.3], [1.0, -1.6, 0.9], record.inputs[:, 0])
-    y += 0.01 * np.random.default_rng(0).standard_normal(len(y))
-    fit = dgp.fit(model, record.with_outputs(y), method="map", workers=1, progress=False)
-    near, laplace = posterior_draws.normal_near(fit), posterior_draws.laplace(fit, fit.mode)
-    ratio = torch.linalg.svdvals(torch.linalg.solve(laplace.scale_tril[0], near.scale_tril[0]))
-    assert 0.7 < ratio.min() <= ratio.max() < 1.4
-    tenth = posterior_draws.normal_near(fit, 0.1).scale_tril
-    torch.testing.assert_close(tenth, 0.1 * near.scale_tril)
 
 
 def test_one_free_run_serves_every_output(sensor, monkeypatch):
