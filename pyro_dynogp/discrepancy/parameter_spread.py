@@ -50,13 +50,15 @@ def normal_near(fit: Fit, settings: LoopSettings, share: float = 1.0) -> Mixture
         innovations = innovations_of(potential)
         z = potential.pack(fit.mode)
         here = None if innovations is None else innovations.local(z.numpy())
-    if here is None:
+    if innovations is None or here is None:
         root = laplace(fit, fit.mode).scale_tril[0]
     else:
-        outputs = [np.tile(np.arange(one.n_outputs), len(one)) for one in fit.records]
-        there = [np.isfinite(one.outputs).reshape(-1) for one in fit.records]
-        places = np.concatenate([a[b] for a, b in zip(outputs, there, strict=True)])
-        root = torch.as_tensor(root_beside_colour(here, places, settings))
+        there = np.concatenate([
+            ~np.isnan(y.numpy().reshape(-1)) for y in innovations.density.observations
+        ])  # fmt: skip
+        n_outputs = fit.records[0].n_outputs
+        outputs = np.tile(np.arange(n_outputs), len(there) // n_outputs)[there]
+        root = torch.as_tensor(root_beside_colour(here, outputs, settings))
     return Mixture.normal(potential, z, share * root)
 
 
@@ -83,6 +85,6 @@ def root_beside_colour(here: Local, outputs: np.ndarray, settings: LoopSettings)
     outer = bounded_root(here.fisher + here.prior)
     curvature, axes = np.linalg.eigh(outer.T @ inner @ outer)
     # The prior may bend upwards somewhere, and rounding makes little of nothing.
-    curvature = np.maximum(curvature, 1e-6)
-    covariance = outer @ (axes * curvature) @ axes.T @ outer.T
-    return np.linalg.cholesky(0.5 * (covariance + covariance.T))
+    root = outer @ (axes * np.sqrt(np.maximum(curvature, 1e-6)))
+    lower = np.asarray(np.linalg.qr(root.T)[1]).T
+    return np.asarray(lower * np.where(np.diag(lower) < 0.0, -1.0, 1.0))

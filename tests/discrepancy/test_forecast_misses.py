@@ -56,6 +56,7 @@ def test_errors_far_beyond_the_noise_are_said(monkeypatch: pytest.MonkeyPatch) -
         "0.5)."
     )
     assert "('b' inf for 0.5)" in missed(monkeypatch, np.inf)
+    assert "('b' inf for 0.5)" in missed(monkeypatch, 1e200)
 
 
 @pytest.mark.parametrize(

@@ -125,6 +125,30 @@ def test_beside_white_errors_it_is_laplaces(
     torch.testing.assert_close(tenth, 0.1 * near.scale_tril)
 
 
+def test_errors_of_two_outputs_of_two_records_are_told_apart(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng, n = np.random.default_rng(5), 60
+    records = []
+    for _ in range(2):
+        y = rng.standard_normal((n, 2))
+        y[rng.random((n, 2)) < 0.2] = np.nan
+        records.append(dgp.Record(np.arange(float(n)), rng.standard_normal(n), y))
+    model = dgp.LinearDynamicGP(1, pairs=1, outputs=2, process_noise=False)
+    fit = dgp.fit(model, records, method="map", restarts=1, workers=1, progress=False)
+    seen: list[np.ndarray] = []
+
+    def noted(here: Any, outputs: np.ndarray, settings: Any) -> np.ndarray:
+        assert here.level.shape[1] == len(outputs)
+        seen.append(outputs)
+        return root_beside_colour(here, outputs, settings)
+
+    monkeypatch.setattr(module, "root_beside_colour", noted)
+    normal_near(fit, SETTINGS)
+    expected = [np.tile([0, 1], n)[np.isfinite(one.outputs).reshape(-1)] for one in records]
+    np.testing.assert_array_equal(seen[0], np.concatenate(expected))
+
+
 def test_without_derivatives_of_errors_it_is_laplaces(monkeypatch: pytest.MonkeyPatch) -> None:
     fit = plant(0.0)
     monkeypatch.setattr(module, "innovations_of", lambda potential: None)
