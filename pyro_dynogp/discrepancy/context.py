@@ -219,7 +219,7 @@ class SearchContext:
         noisy = self.refit(fit, with_process_noise(fit.model))
         return None if self.hiding(noisy, fit) else noisy
 
-    def confirm(self, chosen: Any, current: Fit, number: int, weighed: bool = False) -> Confirmed:
+    def confirm(self, chosen: Any, current: Fit, number: int, weighed: bool) -> Confirmed:
         """Refit what is chosen in a round, and judge it; see `decision.confirm`."""
         return confirm(
             chosen, current, self.data.known, self.held_out, number=number,

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 def forecast_misses(fit: Fit, record: Record, held_out: np.ndarray) -> str:
     """In words, that forecasts of held-out data miss by far more than the noise; empty if not.
 
-    One step ahead process noise explains what a model lacks, and residual tests see little of it:
-    a motor with a dead zone that forecast 328 samples with 5 times the noise had no effect with a
-    false discovery rate below 0.16, and a function of its input was worth 37 nats of evidence.
+    One step ahead process noise explains what a model lacks, and residual tests see little of it.
+    Forecasts of a motor with a dead zone missed by 5 times the noise, the most certain test had a
+    false discovery rate of 0.25, and a function of its input was worth 37 nats of evidence.
 
     Args:
         fit: to what is not held out. record: along which. held_out: (n,) True where it is.

@@ -109,10 +109,10 @@ def _recorders(kept: Study, number: int) -> Iterator[tuple[Any, str, Any]]:
         given[:] = args
         return search.candidates_of(*args[:-1], replace(args[-1], relative=max(RELATIVE)))
 
-    def confirming(self: Any, chosen: Any, current: Any, round_: int) -> Any:
+    def confirming(self: Any, chosen: Any, current: Any, round_: int, weighed: bool) -> Any:
         for value in RELATIVE:  # the default comes last, and goes on
             chosen = search.candidates_of(*given[:-1], replace(self.settings, relative=value))
-            result = confirm(self, chosen, current, round_) if chosen else None
+            result = confirm(self, chosen, current, round_, weighed) if chosen else None
             name = result.winner.effect.name if result is not None and result.winner else ""
             kept.winners.append(
                 {"plant": number, "round": round_, "relative": value, "name": name,
