@@ -8,7 +8,8 @@ import numpy as np
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.density import Potential
-from pyro_dynogp.inference.optimise.gauss_newton import LEAST, Innovations, has_innovations
+from pyro_dynogp.inference.optimise.gauss_newton import LEAST
+from pyro_dynogp.inference.optimise.innovation_energy import Innovations, has_innovations
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
 

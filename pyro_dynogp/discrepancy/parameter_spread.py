@@ -24,7 +24,7 @@ from pyro_dynogp.criticism.posterior_draws import laplace
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.laplace import innovations_of
 from pyro_dynogp.inference.optimise.descent import bounded_root
-from pyro_dynogp.inference.optimise.gauss_newton import Local
+from pyro_dynogp.inference.optimise.innovation_energy import Local
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.statistics.autoregression import fitted_filter
 from pyro_dynogp.statistics.settings import LoopSettings

@@ -30,7 +30,7 @@ from torch import Tensor
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.free_runs import free_run_error, noise_sites
-from pyro_dynogp.inference.optimise.gauss_newton import Innovations, has_innovations
+from pyro_dynogp.inference.optimise.innovation_energy import Innovations, has_innovations
 from pyro_dynogp.inference.optimise.maximum import Effort, maximise, optimizer_near
 from pyro_dynogp.inference.optimise.optimum import Optimum
 from pyro_dynogp.inference.run import Run

@@ -1,6 +1,6 @@
 r"""Normals around modes: Laplace's approximation, from a Hessian or from the Fisher matrix.
 
-The Fisher matrix F of one-step predictions (`inference.optimise.gauss_newton`) takes d + 1 runs of
+The Fisher matrix F of one-step predictions (`optimise.innovation_energy`) takes d + 1 runs of
 the filter that go through it together, where differences for a Hessian take gradients at 2 d
 points, and it is never indefinite. Of static functions' values, given all else, the normal with
 precision F + F_prior is nearly the posterior (Wiener, Hammerstein and Wiener-Hammerstein models of
@@ -19,7 +19,8 @@ from torch import Tensor
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.log_joint import Direct
 from pyro_dynogp.inference.optimise.descent import WIDEST, bounded_root, descend, polished
-from pyro_dynogp.inference.optimise.gauss_newton import Innovations, climb, has_innovations
+from pyro_dynogp.inference.optimise.gauss_newton import climb
+from pyro_dynogp.inference.optimise.innovation_energy import Innovations, has_innovations
 
 # Most iterations to the mode of the unconstrained vector's density: by gradients and Hessians, and
 # by Gauss-Newton.

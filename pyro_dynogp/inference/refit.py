@@ -49,8 +49,9 @@ SAME_STEPS, ADAM_STEPS, SVI_STEPS = 300, 200, 400
 LINEAR_STEPS, LAYERED_STEPS = 100, 100
 ADDED_STEPS: Mapping[str, int] = MappingProxyType({"gauss-newton": 60, "lbfgs": 300, "adam": 300})
 # Starts from linear fits of its own that a model with a layer more has beside what is learnt; those
-# of one with more hidden signals than outputs, or other dynamics than the learnt; and iterations.
-FRESH, REPLACED, FRESH_STEPS = 4, 12, 40
+# of one with more hidden signals than outputs, or other dynamics than the learnt; of one with
+# functions in feedback beside learnt ones, of which three more came to nothing; and iterations.
+FRESH, REPLACED, FRESH_BACK, FRESH_STEPS = 4, 12, 1, 40
 # Of the same model every start goes on, near its optimum; of a linear one that is extended half of
 # them do, side by side, as processors are kept busy by other trials. With feedback all go on: after
 # few iterations their order says little (of nine plants two chose a start 180 nats below another).
@@ -276,7 +277,8 @@ def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
         line = target.has_feedback and fit.model.is_linear
         if not run.steps and (not line or have_no_place(target.layers)):
             many = any(layer.mostly_hidden for _, layer in target.dynamic)
-            count = REPLACED if many else FRESH
+            learnt = target.has_feedback and not have_no_place(target.layers)
+            count = REPLACED if many else FRESH_BACK if learnt else FRESH
             starts += starting_points(target, records, run, count=count, steps=FRESH_STEPS)
         optimizer = _optimizer_of_layer(target)
         return climb(target, records, starts, [], run, optimizer=optimizer, effort=effort,

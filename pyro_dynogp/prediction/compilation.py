@@ -16,7 +16,7 @@ import torch
 
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.inference.density import Potential
-from pyro_dynogp.inference.optimise.gauss_newton import Innovations
+from pyro_dynogp.inference.optimise.innovation_energy import Innovations
 from pyro_dynogp.models.architectures import LinearDynamicGP, Wiener
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.nonlinear_feedback import NonlinearFeedback

@@ -10,7 +10,8 @@ from pyro_dynogp.data.channels import Play
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.function_evidence import kernel_sites
 from pyro_dynogp.inference.optimise.chord import along_chord
-from pyro_dynogp.inference.optimise.gauss_newton import Innovations, Local, climb
+from pyro_dynogp.inference.optimise.gauss_newton import climb
+from pyro_dynogp.inference.optimise.innovation_energy import Innovations, Local
 from pyro_dynogp.models.variants import with_channel
 from tests.inference.test_numbers_of_functions import WIDTH, sprung
 

@@ -24,7 +24,7 @@ from pyro_dynogp.inference.function_evidence import (
 )
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.mode import at_optimum
-from pyro_dynogp.inference.optimise.gauss_newton import Innovations
+from pyro_dynogp.inference.optimise.innovation_energy import Innovations
 from pyro_dynogp.inference.optimise.maximum import maximise
 from pyro_dynogp.inference.optimise.optimum import Optimum
 from pyro_dynogp.inference.refit import refit

@@ -9,15 +9,8 @@ import torch
 import pyro_dynogp as dgp
 from pyro_dynogp.data.channels import Trend
 from pyro_dynogp.inference.density import Potential
-from pyro_dynogp.inference.optimise.gauss_newton import (
-    FEW,
-    FLAT,
-    RIDGE,
-    Innovations,
-    Local,
-    climb,
-    has_innovations,
-)
+from pyro_dynogp.inference.optimise.gauss_newton import FEW, FLAT, RIDGE, climb, climb_together
+from pyro_dynogp.inference.optimise.innovation_energy import Innovations, Local, has_innovations
 from pyro_dynogp.inference.optimise.lengths import Lengths
 from pyro_dynogp.inference.optimise.maximum import maximise, optimizer_for, optimizer_near
 from pyro_dynogp.inference.run import Run
@@ -254,6 +247,30 @@ def test_a_climb_with_functions_ends_on_a_ridge(monkeypatch, functions, steps):
     _, history, message = climb(innovations, z, 20)
     assert len(history) == steps
     assert message == ("nothing left to gain" if functions else "all steps used")
+
+
+@pytest.mark.parametrize("name", ["feedback", "Wiener", "known trajectory"])
+def test_starts_that_climb_together_go_where_each_goes_alone(name):
+    innovations, z = prepared(name)
+    starts = [z, z + 0.1, z - 0.05]
+    for start, (end, history, message) in zip(
+        starts, climb_together(innovations, starts, 4), strict=True
+    ):
+        alone, steps, said = climb(innovations, start, 4)
+        np.testing.assert_allclose(history, steps, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(end, alone, rtol=1e-3, atol=1e-3)
+        assert message == said
+
+
+def test_points_of_starts_that_climb_together_are_evaluated_together(monkeypatch):
+    """Twice as many starts, as many calls."""
+    innovations, z = prepared("feedback")
+    through, calls = innovations._portion, []
+    monkeypatch.setattr(innovations, "_portion", lambda x: calls.append(len(x)) or through(x))
+    climb_together(innovations, [z, z], 3)
+    both, calls[:] = list(calls), []
+    climb_together(innovations, [z, z, z, z], 3)
+    assert calls == [2 * count for count in both]
 
 
 def test_default_starts_end_at_least_as_high_as_random_ones_by_lbfgs(record):

@@ -15,7 +15,7 @@ from pyro_dynogp.inference.laplace import fisher_normal, laplace, log_evidence
 from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.methods.normal import log_weights
 from pyro_dynogp.inference.optimise.descent import WIDEST
-from pyro_dynogp.inference.optimise.gauss_newton import Innovations
+from pyro_dynogp.inference.optimise.innovation_energy import Innovations
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.plans import starting_points
 from tests.conftest import simulate_record

@@ -11,7 +11,7 @@ from pyro_dynogp.discrepancy.parameters import parameters_of
 from pyro_dynogp.effects.dead_time import _later
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.methods.base import Problem
-from pyro_dynogp.inference.optimise.gauss_newton import Innovations
+from pyro_dynogp.inference.optimise.innovation_energy import Innovations
 from pyro_dynogp.inference.starts.delays import delayed_starts, likely_delays, moved
 from pyro_dynogp.models.delays import longest_delay
 

@@ -160,16 +160,23 @@ def test_what_is_new_in_feedback_is_looked_for_along_an_excerpt_of_long_records(
 
 
 @pytest.mark.parametrize(
-    ("options", "fresh"),
+    ("make", "options", "fresh"),
     [
-        ({"output": False, "hidden": True, "step": False}, [refits.FRESH]),
-        ({"output": False, "hidden": True}, []),
-        ({}, []),
+        (dgp.LinearDynamicGP, {"output": False, "hidden": True, "step": False}, [refits.FRESH]),
+        (dgp.LinearDynamicGP, {"output": False, "hidden": True}, []),
+        (dgp.LinearDynamicGP, {}, []),
+        (dgp.Wiener, {"output": False, "hidden": True, "step": False}, [refits.FRESH]),
+        (dgp.Wiener, {}, [refits.FRESH_BACK]),
     ],
 )
-def test_a_smooth_function_of_a_hidden_signal_starts_afresh_as_well(monkeypatch, options, fresh):
-    """A spring between two masses was 70 nats lower where only what the line knew was a start."""
-    record, model = make_record(n=60, missing=False), dgp.LinearDynamicGP(1, pairs=1)
+def test_functions_that_have_no_place_or_others_beside_start_afresh_as_well(
+    monkeypatch, make, options, fresh
+):
+    """A spring between two masses was 70 nats lower where only what the line knew was a start.
+
+    A function of the output of a motor with a sensor that is not linear was 120.
+    """
+    record, model = make_record(n=60, missing=False), make(1, pairs=1)
     fit = dgp.fit(model, record, method="map", restarts=1, workers=1, progress=False)
     asked, climb = [], refits.climb
 

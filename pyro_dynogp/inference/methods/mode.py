@@ -15,7 +15,7 @@ from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.free_runs import free_run_error, noise_pays, silenced
 from pyro_dynogp.inference.function_evidence import kernels_by_evidence
 from pyro_dynogp.inference.methods.base import Problem
-from pyro_dynogp.inference.optimise.gauss_newton import has_innovations
+from pyro_dynogp.inference.optimise.innovation_energy import has_innovations
 from pyro_dynogp.inference.optimise.maximum import (
     Effort,
     Optimizer,

@@ -25,7 +25,8 @@ from pyro_dynogp.inference.function_evidence import kernel_sites
 from pyro_dynogp.inference.log_joint import Direct
 from pyro_dynogp.inference.optimise.chord import along_chord
 from pyro_dynogp.inference.optimise.descent import bounded_root, piece
-from pyro_dynogp.inference.optimise.gauss_newton import Innovations, climb, has_innovations
+from pyro_dynogp.inference.optimise.gauss_newton import climb
+from pyro_dynogp.inference.optimise.innovation_energy import Innovations, has_innovations
 
 # Nats below the top at which the density counts as zero; how often a range is doubled or halved to
 # find that depth; points of the grid for each of two numbers.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pyro_dynogp.inference.optimise.gauss_newton import Innovations, Local
+from pyro_dynogp.inference.optimise.innovation_energy import Innovations, Local
 
 # Least curvature: along what hardly curves a gradient that is nearly right leads far away.
 LEAST = 1.0

@@ -10,11 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from queue import SimpleQueue
 from threading import Thread
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
 Result = TypeVar("Result")
+# What there is to know at points (k, d): arrays (k, ...).
+Answer = TypeVar("Answer", bound=tuple[np.ndarray, ...])
 # Values (k,) and gradients (k, d) at points (k, d).
 Functions = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -24,7 +26,8 @@ class _StoppedError(Exception):
 
 
 def in_lockstep(
-    functions: Functions, runs: Sequence[Callable[[Functions], Result]]
+    functions: Callable[[np.ndarray], Answer],
+    runs: Sequence[Callable[[Callable[[np.ndarray], Answer]], Result]],
 ) -> list[Result]:
     """Results of optimisers, in their order; each is called with the functions to minimise.
 
@@ -34,10 +37,10 @@ def in_lockstep(
     if len(runs) == 1:
         return [runs[0](functions)]
     asked: SimpleQueue[tuple[int, str, Any]] = SimpleQueue()
-    answers: list[SimpleQueue[tuple[np.ndarray, np.ndarray] | None]] = [SimpleQueue() for _ in runs]
+    answers: list[SimpleQueue[Answer | None]] = [SimpleQueue() for _ in runs]
 
     def work(i: int) -> None:
-        def waiting(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        def waiting(z: np.ndarray) -> Answer:
             asked.put((i, "points", np.array(z, dtype=float)))
             answer = answers[i].get()
             if answer is None:
@@ -65,11 +68,11 @@ def in_lockstep(
                 (points if what == "points" else results)[i] = content
             if points:
                 order = sorted(points)
-                values, gradients = functions(np.concatenate([points[i] for i in order]))
+                found = functions(np.concatenate([points[i] for i in order]))
                 ends = np.cumsum([len(points[i]) for i in order])[:-1]
-                parts = zip(np.split(values, ends), np.split(gradients, ends), strict=True)
+                parts = zip(*(np.split(x, ends) for x in found), strict=True)
                 for i, part in zip(order, parts, strict=True):
-                    answers[i].put(part)
+                    answers[i].put(cast("Answer", part))
     finally:
         for answer in answers:
             answer.put(None)

@@ -17,7 +17,7 @@ from pyro_dynogp.inference.log_joint import Direct
 from pyro_dynogp.inference.optimise import gauss_newton
 from pyro_dynogp.inference.optimise.adam import RATE, adam
 from pyro_dynogp.inference.optimise.descent import descend, lbfgs, polished
-from pyro_dynogp.inference.optimise.gauss_newton import has_innovations
+from pyro_dynogp.inference.optimise.innovation_energy import Innovations, has_innovations
 from pyro_dynogp.inference.optimise.lengths import Lengths
 from pyro_dynogp.inference.optimise.lockstep import Functions, in_lockstep
 from pyro_dynogp.inference.optimise.optimum import Optimum, from_piece, to_piece
@@ -144,8 +144,8 @@ def _climbs(potential: Potential, task: _Task) -> tuple[list[Climb], np.ndarray]
 
     if task.optimizer == "gauss-newton":
         free = np.setdiff1d(np.arange(potential.size), held)
-        innovations = gauss_newton.Innovations(potential, free)
-        found = [gauss_newton.climb(innovations, z, task.steps) for z in starts]
+        innovations = Innovations(potential, free)
+        found = gauss_newton.climb_together(innovations, starts, task.steps)
     else:
         method = _METHODS[task.optimizer]
 
@@ -230,8 +230,9 @@ def maximise(
     first `learnt` starts climb to the end whatever others come to: next to other data or finer
     steps what is learnt begins low, and may end highest.
     """
-    # Gauss-Newton evaluates several points by itself.
-    together = 1 if optimizer == "gauss-newton" else effort.together
+    # Of a linear model Gauss-Newton has compiled functions alone.
+    alone = optimizer == "gauss-newton" and getattr(model, "is_linear", False)
+    together = 1 if alone else effort.together
 
     def climb(
         values: Sequence[dict[str, Tensor]], count: int, label: str, *, last: bool = False
