@@ -9,13 +9,13 @@ import numpy as np
 
 from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.discrepancy.held_out import LITTLE_ELSE, NOISE_ALONE, are_noise
 from pyro_dynogp.discrepancy.joint_refits import confirmed_together
 from pyro_dynogp.discrepancy.judged import Judged, kind_of
 from pyro_dynogp.discrepancy.refits import Refits
 from pyro_dynogp.discrepancy.result import Attempt
 from pyro_dynogp.discrepancy.search import Candidate, Found
 from pyro_dynogp.discrepancy.stretches import latest
-from pyro_dynogp.discrepancy.trials import LITTLE_ELSE, NOISE_ALONE, are_noise
 from pyro_dynogp.fitting import Fit
 from pyro_dynogp.inference.bayes_factor import VERY_STRONG, counted, log_bayes_factor
 from pyro_dynogp.models.variants import Model

@@ -8,8 +8,7 @@ import numpy as np
 
 from pyro_dynogp.data.channels import count_direct
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.discrepancy.held_out import forecast_errors
-from pyro_dynogp.discrepancy.trials import LITTLE_ELSE
+from pyro_dynogp.discrepancy.held_out import LITTLE_ELSE, forecast_errors
 
 if TYPE_CHECKING:
     from pyro_dynogp.fitting import Fit

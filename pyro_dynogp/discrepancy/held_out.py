@@ -16,6 +16,14 @@ from pyro_dynogp.prediction.first_state import beginning
 from pyro_dynogp.prediction.predict import forecast
 from pyro_dynogp.statistics.settings import LoopSettings
 
+# Errors of forecasts are noise alone up to so many of its standard deviations: parameters learnt
+# from a few hundred samples add some percent, and so many errors tell their size to four.
+NOISE_ALONE = 1.1
+# Other dynamics are tried beside more than this: what an effect leaves that is not described is
+# several times the noise, and parameters of a step or a cube, learnt from 500 samples of systems
+# with friction, add up to half of it. They take most of the time.
+LITTLE_ELSE = 1.5
+
 
 def without(record: Record, fold: np.ndarray) -> Record:
     """The record with the outputs of a fold missing; cut where nothing is left to the end."""
@@ -90,3 +98,11 @@ def certain(gains: np.ndarray, settings: LoopSettings) -> bool:
     """Whether gains (N,) of single samples are certainly more than nothing in all [nats]."""
     error = settings.standard_errors * block_standard_error(gains)[0]
     return bool(gains.sum() > max(settings.gain, error))
+
+
+def are_noise(errors: np.ndarray, fit: Fit, most: float = NOISE_ALONE) -> bool:
+    """Whether errors (M, n_y) of forecasts are at most so often the noise that a fit has learnt."""
+    if fit.system.noise.constant_sd is None:  # its size varies
+        return False
+    rmse = np.sqrt(np.nanmean(np.square(errors), axis=0))
+    return bool((rmse <= most * fit.noise_sd).all())

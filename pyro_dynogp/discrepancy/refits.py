@@ -89,18 +89,35 @@ class Refits:
 
         Then as many at a time as there are workers, with a look at the clock between.
         """
-        trials = list(tasks.values())
-        step = len(trials) if self.late is None else self.workers or joblib.cpu_count()
-        done: list[Tried] = []
-        for begin in range(0, len(trials), max(step, 1)):
-            if self.late is not None and self.late():
-                self.early = True
+        workers = self.workers or joblib.cpu_count()
+        bar = f"{label}, round {self.number}"
+        long = [key for key, trial in tasks.items() if trial.is_long]
+        plain = [key for key in tasks if key not in long]
+        step = max(len(plain) if self.late is None else workers, 1)
+        done: dict[Any, Tried] = {}
+
+        def is_late() -> bool:
+            self.early = self.early or (self.late is not None and self.late())
+            return self.early
+
+        for begin in range(0, len(plain), step):
+            if is_late():
+                return done
+            some = plain[begin : begin + step]
+            trials = [tasks[key] for key in some]
+            tried = parallel_map(
+                run, trials, workers=self.workers, progress=self.progress, description=bar
+            )
+            done.update(zip(some, tried, strict=True))
+        # Trials that take most of the time have all processors, one after the other.
+        label = f"variants, round {self.number}" if self.progress else ""
+        for key in long:
+            if is_late():
                 break
-            done += parallel_map(
-                run, trials[begin : begin + step], workers=self.workers, progress=self.progress,
-                description=f"{label}, round {self.number}",
-            )  # fmt: skip
-        return dict(zip(tasks, done, strict=False))
+            (done[key],) = parallel_map(
+                lambda trial: run(trial, workers, label), [tasks[key]], workers=1
+            )
+        return {key: done[key] for key in tasks if key in done}
 
     def judge(self, candidates: Sequence[Candidate]) -> list[Judged]:
         """Candidates, each against the model without it; those that were refitted in time."""

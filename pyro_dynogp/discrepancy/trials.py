@@ -6,12 +6,21 @@ import itertools
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
+from tqdm import tqdm
 
-from pyro_dynogp.data.channels import prepared
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.discrepancy.held_out import certain, held_out_density, scored, without
+from pyro_dynogp.discrepancy.failures import why_not
+from pyro_dynogp.discrepancy.held_out import (
+    LITTLE_ELSE,
+    are_noise,
+    certain,
+    held_out_density,
+    scored,
+    without,
+)
 from pyro_dynogp.discrepancy.rehearsal import lasting
 from pyro_dynogp.effects.base import Compared, Score
 from pyro_dynogp.fitting import Fit
@@ -22,18 +31,10 @@ from pyro_dynogp.models.delays import comparable, longest_delay
 from pyro_dynogp.models.feedback_variants import with_usual_substeps
 from pyro_dynogp.models.variants import Model
 from pyro_dynogp.statistics.settings import LoopSettings
+from pyro_dynogp.support.parallel import parallel_map
 
 # Most steps of one size that a number of a variant takes.
 MOVES = 4
-# A signal that varies by no more than this share of its size is constant, as for a fit.
-CONSTANT = 1e-12
-# Errors of forecasts are noise alone up to so many of its standard deviations: parameters learnt
-# from a few hundred samples add some percent, and so many errors tell their size to four.
-NOISE_ALONE = 1.1
-# Other dynamics are tried beside more than this: what an effect leaves that is not described is
-# several times the noise, and parameters of a step or a cube, learnt from 500 samples of systems
-# with friction, add up to half of it. They take most of the time.
-LITTLE_ELSE = 1.5
 
 
 @dataclass(frozen=True)
@@ -66,8 +67,13 @@ class Trial:
 
     @property
     def run(self) -> Run:
-        """How refits are run: trials share the processors."""
+        """How refits are run: trials, or variants of one, share the processors."""
         return Run(self.seed, workers=1)
+
+    @property
+    def is_long(self) -> bool:
+        """Whether its variants are compared ahead, and so fitted one by one."""
+        return len(self.models) > 1 and self.compared != "training"
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,14 +97,31 @@ class Tried:
     errors: np.ndarray = field(default_factory=lambda: np.zeros((0, 1)))
 
 
-def run(trial: Trial) -> Tried:
-    """Refit the variants on the first fold's training data, the best on all; score the folds."""
+# Fits of variants, and why others could not be fitted.
+_Refitted = tuple[list[Fit], list[ValueError]]
+
+
+class _Rated(NamedTuple):
+    """A variant's fit, and densities and errors of its forecasts as of `scored`."""
+
+    fit: Fit
+    densities: np.ndarray
+    errors: np.ndarray
+
+
+def run(trial: Trial, workers: int = 1, progress: str = "") -> Tried:
+    """Refit the variants on the first fold's training data, the best on all; score the folds.
+
+    Args:
+        trial: what to refit. workers: processes for variants that are compared ahead; results are
+            the same. progress: label of a bar over these, "" for none.
+    """
     begin = time.perf_counter()
     first: Fit | None = None
     parts, beside = [np.zeros(0)], [np.zeros((0, trial.record.n_outputs))]
     failure = ""
     try:
-        first = _kept(trial, without(trial.record, trial.folds[0]))
+        first = _kept(trial, without(trial.record, trial.folds[0]), workers, progress)
         for index, fold in enumerate(trial.folds):
             found = first
             if index > 0:
@@ -108,7 +131,8 @@ def run(trial: Trial) -> Tried:
             parts.append(density)
             beside.append(error)
     except ValueError as error:
-        failure, parts = why_not(trial, error), [np.zeros(0)]
+        failure = why_not(trial.models, trial.record, trial.folds, error)
+        parts = [np.zeros(0)]
     return Tried(
         trial.models[0] if first is None else _unscaled(first),
         np.concatenate(parts),
@@ -119,33 +143,12 @@ def run(trial: Trial) -> Tried:
     )
 
 
-def why_not(trial: Trial, error: ValueError) -> str:
-    """Why none of the variants could be fitted, in words of the data rather than of the refit."""
-    several = len(trial.folds) > 1
-    where = "training blocks" if several else "training block"
-    reasons: list[str] = []
-    for model, fold in itertools.product(trial.models, trial.folds):
-        names = [name for channel in model.channels for name in channel.names]
-        if len(set(names)) < len(names):
-            twice = next(name for name in names if names.count(name) > 1)
-            reasons.append(f"the model has {twice!r} already")
-            continue
-        training = without(trial.record, fold)
-        for place, channel in enumerate(model.channels):
-            columns = channel.columns(prepared(training, model.channels[:place]))
-            for name, x in zip(channel.names, columns.T, strict=True):
-                if np.ptp(x) <= CONSTANT * np.abs(x).max():
-                    reasons.append(f"{name!r} is constant on the {where}")
-    # What else a refit refuses, without what its caller should do about it.
-    return reasons[0] if reasons else str(error).partition(". ")[0].rstrip(".")
-
-
-def _kept(trial: Trial, training: Record) -> Fit:
+def _kept(trial: Trial, training: Record, workers: int, progress: str) -> Fit:
     """The variant that is kept, fitted to the training data."""
     if trial.fit is not None:
         return trial.fit
-    if len(trial.models) > 1 and trial.compared != "training":
-        return _best_ahead(trial, training)
+    if trial.is_long:
+        return _best_ahead(trial, training, workers, progress)
     (model, *others), start = trial.models, trial.base
     finer = _finer(trial, model, training, 0)
     if others or finer:
@@ -194,7 +197,7 @@ def _refined(
     return start
 
 
-def _best_ahead(trial: Trial, training: Record) -> Fit:
+def _best_ahead(trial: Trial, training: Record, workers: int, progress: str) -> Fit:
     """The first variant, or a later one that is certainly better on the data held out.
 
     A block that goes beyond what the training data have seen says little of a shape: of shapes that
@@ -202,48 +205,42 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
 
     Where they differ in how they extrapolate what is right in one stretch may be luck: of those
     that are rehearsed only those count whose forecasts are no worse than those of the base held at
-    its last level, or else the last one, which leaves most open. Of others the first two are
-    fitted, and later ones while none leaves nothing but noise; those that join what two earlier
-    ones have, which take most of the time, only where one of these forecasts best, and better than
-    the base; other dynamics only beside more than `LITTLE_ELSE`, of the noise of the base, too.
-    Variants that cannot be fitted are left out.
+    its last level, or else the last one, which leaves most open. Of others those are fitted that
+    are `_wanted`. Variants that cannot be fitted are left out.
     """
     fold, settings = trial.folds[0], trial.settings
-    problems: list[ValueError] = []
 
-    def refitted(models: Sequence[Model]) -> list[Fit]:
-        fits, why = refits(trial.base, models, training, lambda _: trial.run)
-        problems.extend(why)
-        return fits
+    def refitted(places: Sequence[int], label: str = "") -> list[_Refitted]:
+        return parallel_map(
+            lambda place: refits(trial.base, [trial.models[place]], training, lambda _: trial.run),
+            places, workers=workers, progress=bool(label), description=label,
+        )  # fmt: skip
 
-    def rated(fits: Sequence[Fit]) -> list[tuple[Fit, np.ndarray, np.ndarray]]:
-        return [(fit, *scored(fit, trial.record, fold, trial.score)) for fit in fits]
+    def rated(fits: Sequence[Fit]) -> list[_Rated]:
+        return [_Rated(fit, *scored(fit, trial.record, fold, trial.score)) for fit in fits]
 
+    every = range(len(trial.models))
+    found: list[_Rated] = []
+    made: dict[int, _Refitted] = {}
     if trial.compared == "rehearsed":
+        made.update(zip(every, refitted(every, progress), strict=True))
+        fits = [fit for done, _ in made.values() for fit in done]
         # But those that the training data say nothing of, as a later ramp.
-        fits = refitted(trial.models)
         if fits:
             fits = lasting(fits, trial.base, trial.record, fold, trial.run, settings) or fits[-1:]
         found = rated(fits)
     else:
-        found = rated(refitted(trial.models[:2]))
-        for place, model in enumerate(trial.models[2:], 2):
-            if found:
-                leading, most, errors = max(found, key=lambda one: float(one[1].sum()))
-                if are_noise(errors, leading):
-                    break
-                if _has_other_dynamics(model) and all(
-                    are_noise(errors, fit, LITTLE_ELSE) for fit in (leading, trial.base)
-                ):
-                    continue
-                joined = [_back(one) for one in trial.models[:place] if _back(one) < _back(model)]
-                if len(joined) > 1:
-                    least = held_out_density(trial.base, trial.record, fold, trial.score)
-                    if most.sum() <= least.sum() or _back(leading.model) not in joined:
-                        continue
-            found += rated(refitted([model]))
+        for place in tqdm(every, desc=progress, disable=not progress):
+            if not _wanted(trial, place, found):
+                continue
+            if place not in made:
+                # What is not wanted once others are rated is dropped again.
+                later = (k for k in every[place:] if k not in made and _wanted(trial, k, found))
+                ahead = list(itertools.islice(later, workers))
+                made.update(zip(ahead, refitted(ahead), strict=True))
+            found += rated(made[place][0])
     if not found:
-        raise problems[0]
+        raise next(why for _, problems in made.values() for why in problems)
     shape = trial.compared == "held out"
     best, highest, _ = found[0]
     for one, own, _ in found[1:]:
@@ -251,6 +248,31 @@ def _best_ahead(trial: Trial, training: Record) -> Fit:
         if certain(gain, settings) or (shape and _is_more_probable(one, best, gain, settings)):
             best, highest = one, own
     return best
+
+
+def _wanted(trial: Trial, place: int, found: Sequence[_Rated]) -> bool:
+    """Whether the variant at a place is fitted, given what those before it come to.
+
+    The first two are, and later ones while none leaves nothing but noise; those that join what two
+    earlier ones have, which take most of the time, only where one of these forecasts best, and
+    better than the base; other dynamics only beside more than `LITTLE_ELSE`, of the noise of the
+    base, too.
+    """
+    if place < 2 or not found:
+        return True
+    leading, most, errors = max(found, key=lambda one: float(one.densities.sum()))
+    model, before = trial.models[place], trial.models[:place]
+    if are_noise(errors, leading):
+        return False
+    if _has_other_dynamics(model) and all(
+        are_noise(errors, fit, LITTLE_ELSE) for fit in (leading, trial.base)
+    ):
+        return False
+    joined = [_back(one) for one in before if _back(one) < _back(model)]
+    if len(joined) < 2:
+        return True
+    least = held_out_density(trial.base, trial.record, trial.folds[0], trial.score)
+    return bool(most.sum() > least.sum()) and _back(leading.model) in joined
 
 
 def _back(model: Model) -> set[str]:
@@ -261,14 +283,6 @@ def _back(model: Model) -> set[str]:
 def _has_other_dynamics(model: Model) -> bool:
     """Whether dynamics are a chain of lags, or have more hidden signals than outputs."""
     return any(layer.real or layer.mostly_hidden for _, layer in model.dynamic)
-
-
-def are_noise(errors: np.ndarray, fit: Fit, most: float = NOISE_ALONE) -> bool:
-    """Whether errors (M, n_y) of forecasts are at most so often the noise that a fit has learnt."""
-    if fit.system.noise.constant_sd is None:  # its size varies
-        return False
-    rmse = np.sqrt(np.nanmean(np.square(errors), axis=0))
-    return bool((rmse <= most * fit.noise_sd).all())
 
 
 def _is_more_probable(one: Fit, best: Fit, gain: np.ndarray, settings: LoopSettings) -> bool:

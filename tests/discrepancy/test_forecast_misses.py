@@ -15,9 +15,9 @@ from pyro_dynogp.discrepancy import forecast_misses as module
 from pyro_dynogp.discrepancy import state
 from pyro_dynogp.discrepancy.context import Left, Tested
 from pyro_dynogp.discrepancy.forecast_misses import forecast_misses
+from pyro_dynogp.discrepancy.held_out import LITTLE_ELSE
 from pyro_dynogp.discrepancy.search_notes import said_of_misses
 from pyro_dynogp.discrepancy.state import SearchState
-from pyro_dynogp.discrepancy.trials import LITTLE_ELSE
 from pyro_dynogp.models.variants import without_process_noise
 from tests.discrepancy.made import SETTINGS
 from tests.discrepancy.test_decision import spoken_for

@@ -11,9 +11,10 @@ import pyro_dynogp as dgp
 from pyro_dynogp import effects
 from pyro_dynogp.data.channels import Delayed, Play, Recorded, Step, Trend
 from pyro_dynogp.discrepancy import trials
+from pyro_dynogp.discrepancy.failures import why_not
 from pyro_dynogp.discrepancy.held_out import forecast_errors, held_out_density
 from pyro_dynogp.discrepancy.search import candidates_of
-from pyro_dynogp.discrepancy.trials import Trial, run, why_not
+from pyro_dynogp.discrepancy.trials import Trial, run
 from pyro_dynogp.inference import refit as refits
 from pyro_dynogp.inference.bayes_factor import energy
 from pyro_dynogp.inference.density import Potential
@@ -165,7 +166,10 @@ def test_why_a_trial_failed_is_said_in_words_of_the_data(record, base, channels,
 def test_what_else_a_refit_refuses_is_said_without_advice(record, base):
     trial = Trial((MODEL,), record, (np.arange(N) >= 200,), base, 0, SETTINGS)
     error = ValueError("record: expected 7 samples, got 3. Give a longer one (Record.select).")
-    assert why_not(trial, error) == "record: expected 7 samples, got 3"
+    assert (
+        why_not(trial.models, trial.record, trial.folds, error)
+        == "record: expected 7 samples, got 3"
+    )
 
 
 def test_errors_of_forecasts_are_kept_whatever_is_scored(record, base):

@@ -120,24 +120,39 @@ def test_a_limit_that_is_not_reached_changes_nothing(planted: Any) -> None:
 def test_with_a_limit_refits_begin_as_many_at_a_time_as_there_are_workers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    batches: list[int] = []
+    """Long ones come last, and have all of them to themselves."""
+    batches: list[tuple[str, ...]] = []
 
     def several(function: Any, items: Any, **options: Any) -> list[Any]:
-        batches.append(len(items))
-        return list(items)
+        batches.append(tuple(item.name for item in items))
+        return [item.name if options["workers"] == 2 else function(item) for item in items]
 
     monkeypatch.setattr(refits, "parallel_map", several)
-    asked = iter([False, False, True])
-    options: dict[str, Any] = {"number": 1, "workers": 2, "progress": False, "late": asked.__next__}
-    one: Any = SimpleNamespace(**options, early=False)
-    done = refits.Refits.run(one, {k: k for k in "abcdefg"}, "refits")  # type: ignore[misc]
-    assert batches == [2, 2]
-    assert list(done) == ["a", "b", "c", "d"]
+    monkeypatch.setattr(
+        refits, "run", lambda trial, workers, bar: f"{trial.name}, {workers} at a time"
+    )
+    tasks: dict[str, Any] = {
+        name: SimpleNamespace(name=name, is_long=name in "bf") for name in "abcdefg"
+    }
+
+    def run(answers: list[bool] | None) -> tuple[Any, Any]:
+        late = None if answers is None else iter(answers).__next__
+        one = SimpleNamespace(number=1, workers=2, progress=False, late=late, early=False)
+        return one, refits.Refits.run(one, tasks, "refits")  # type: ignore[arg-type]
+
+    one, done = run([False, False, True])
+    assert batches == [("a", "c"), ("d", "e")]
+    assert list(done) == ["a", "c", "d", "e"]
     assert one.early
-    free: Any = SimpleNamespace(**{**options, "late": None}, early=False)
-    refits.Refits.run(free, {k: k for k in "abcdefg"}, "refits")  # type: ignore[misc]
-    assert batches[2:] == [7]
-    assert not free.early
+    one, done = run([False, False, False, False, True])
+    assert batches[2:] == [("a", "c"), ("d", "e"), ("g",), ("b",)]
+    assert list(done) == ["a", "b", "c", "d", "e", "g"]
+    assert done["b"] == "b, 2 at a time"
+    assert one.early
+    one, done = run(None)
+    assert batches[6:] == [("a", "c", "d", "e", "g"), ("b",), ("f",)]
+    assert list(done) == list(tasks)
+    assert not one.early
 
 
 def test_a_comparison_on_one_scale_that_is_cut_short_decides_nothing() -> None:

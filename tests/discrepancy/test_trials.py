@@ -322,6 +322,38 @@ def test_later_variants_are_fitted_one_by_one_while_something_is_left(
     assert [one.model for one in made] == list(models[:fitted])
 
 
+@pytest.mark.parametrize("workers", [1, 2, 3, 40])
+@pytest.mark.parametrize(("noise", "kept"), [(20.0, "step_of_hidden"), (None, "hysteresis")])
+def test_variants_that_are_fitted_side_by_side_come_to_the_same(
+    record, monkeypatch, workers, noise, kept
+):
+    """As many at a time as there are processes; what is not wanted after all does not count."""
+    plain = dgp.LinearDynamicGP(1, pairs=2)
+    said = SimpleNamespace(where={"output": "y", "products": 0.9})
+    models = NonlinearFeedbackOfOutput().extend(plain, said, record)
+    special = {"step_of_hidden": 20.0, "hysteresis": 25.0}
+    levels = [special.get(name, float(place)) for place, name in enumerate(VARIANTS)]
+    groups = []
+
+    def side_by_side(function, places, *, workers, progress, description):
+        groups.append(len(places))
+        return [function(place) for place in places]
+
+    def again(fit, training, *, model, run):
+        return Made(model, levels[models.index(model)], records=(record,))
+
+    refitted_by(monkeypatch, again)
+    monkeypatch.setattr(trials, "parallel_map", side_by_side)
+    monkeypatch.setattr(
+        trials, "are_noise", lambda errors, fit, most=0.0: most == 0.0 and fit.level == noise
+    )
+    fold = np.arange(N) >= TRAINING
+    trial = trials.Trial(tuple(models), record, (fold,), Made(plain, 0.0), 0, SETTINGS,
+                         compared="held out")  # fmt: skip
+    assert trials.run(trial, workers).model == models[VARIANTS.index(kept)]
+    assert max(groups) == min(workers, len(models))
+
+
 @pytest.mark.parametrize("little", [(), ("fits",), ("base",), ("fits", "base")])
 def test_other_dynamics_are_tried_where_more_than_a_little_is_left(record, monkeypatch, little):
     """By the noise of the best variant and of the base: that of a poor fit may be too large."""
