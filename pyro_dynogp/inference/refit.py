@@ -31,11 +31,10 @@ from pyro_dynogp.inference.posteriors import Mixture, Sampled, draws_of_guide
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.dynamic import Values
 from pyro_dynogp.inference.starts.extended import extended_starts
-from pyro_dynogp.inference.starts.linear import linear_starts
+from pyro_dynogp.inference.starts.linear import fresh_starts
 from pyro_dynogp.inference.starts.noise import louder, most_probable, with_likely_noise
 from pyro_dynogp.inference.starts.plans import starting_points
 from pyro_dynogp.inference.starts.poles import grown
-from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
 from pyro_dynogp.models.forms import have_no_place
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.variants import have_same_parameters, without_noise_below_functions
@@ -62,7 +61,7 @@ EXTENDED, LOOPED = Effort(kept=1 / 2, together=8), Effort(kept=1.0, together=8)
 LONG, EXCERPT = 1_600, 1_000
 # Iterations of all variants of an effect, by Gauss-Newton and of others, and more of the leading
 # ones: this share, three at least.
-FIRST_STEPS, MORE_STEPS = (2, 8), (12, 32)
+FIRST_STEPS, MORE_STEPS = (14, 8), (20, 32)
 LEADING, FEWEST = 1 / 5, 3
 # Of NUTS, whose chains start at the mode.
 WARMUP = 300
@@ -97,7 +96,7 @@ def refit(
     several = (records,) if isinstance(records, Record) else tuple(records)
     fit.check_collapsed()
     if model is not None:
-        problem = _problem(model, several)
+        problem = Problem.of(model, several)
         return _posterior(fit, problem, _extended(fit, problem, run), run)
     if len(several) != len(fit.records):
         raise invalid("records", expected=f"{len(fit.records)}, as before", got=str(len(several)))
@@ -163,12 +162,6 @@ def family_of(fit: Fitted) -> Hyperparameters:
     root = fit.posterior.scale_tril[0]
     independent = torch.equal(root, torch.diag(root.diagonal()))
     return "normal" if independent else "multivariate normal"
-
-
-def _problem(model: Model, records: Sequence[Record]) -> Problem:
-    """A model in the units of records; outputs count where the model knows its inputs."""
-    late = longest_delay(model)
-    return Problem.of(model, [where_inputs_are_known(record, late) for record in records])
 
 
 def _again(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
@@ -250,8 +243,7 @@ def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     line (a sensor that reports a size) the linear fit is any of several poor optima: such a model
     starts from linear fits of its own, too; a function in feedback from what is learnt, where
     nothing comes back as yet, and one of hidden signals that has no place from both. Real poles
-    take over nothing from pairs. A linear model with more poles has the starts of a first fit, too:
-    what is new may take the place of what is learnt.
+    take over nothing from pairs.
 
     Process noise that has explained what the smaller model lacks keeps the larger one from it: one
     climb goes without any first, and takes that of a fresh start then. Not where variants are
@@ -283,13 +275,13 @@ def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
         optimizer = _optimizer_of_layer(target)
         return climb(target, records, starts, [], run, optimizer=optimizer, effort=effort,
                      steps=run.steps or ADDED_STEPS[optimizer])  # fmt: skip
+    if target.is_linear:
+        compared = bool(run.steps)
+        starts = [*fresh_starts(fit.model, target, records, run.seed, compared), *starts]
     if run.steps:  # a few, to compare variants
         return climbed(target, [most_probable(target, records, starts)], run.steps)
     if target.is_linear:
-        before, after = (one.dynamic[0][1] for one in (fit.model, target))
-        more = after.pairs > before.pairs or after.integrators > before.integrators
-        fresh = linear_starts(target, records, None, run.seed) if more else []
-        return climbed(target, [*fresh, *starts], LINEAR_STEPS)
+        return climbed(target, starts, LINEAR_STEPS)
     if have_same_parameters(target, fit.model):  # nothing is new but data, or substeps
         (start, *_) = starts
         if target.has_feedback:

@@ -272,10 +272,10 @@ class Model(Structure):
     def begun(self, records: tuple[PreparedRecord, ...]) -> tuple[PreparedRecord, ...]:
         """Records as the density has them, see `PreparedRecord.begun`.
 
-        Models without free dead times, and those whose first states or trajectories are sites along
-        the whole record, have all of it.
+        Models without dead times, and those whose first states or trajectories are sites along the
+        whole record, have all of it.
         """
-        if not self.late or self.state_sites or self.integrate != "all":
+        if not self.is_delayed or self.state_sites or self.integrate != "all":
             return records
         return tuple(record.begun if record.has_outputs else record for record in records)
 

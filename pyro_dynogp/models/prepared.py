@@ -69,8 +69,8 @@ class PreparedRecord:
     def begun(self) -> PreparedRecord:
         """From its first measured output on, with all inputs around it.
 
-        As the density of a model with free dead times has it: what acted before the record is not
-        in it, and nothing is known of the state until all that has arrived.
+        As the density of a model with dead times has it: what acted before the record is not in it,
+        and nothing is known of the state until all that has arrived.
         """
         measured = ~torch.isnan(self.observations).reshape(len(self), -1).all(-1)
         first = int(measured.to(torch.int8).argmax())

@@ -140,6 +140,11 @@ class Structure:
         return free_delays(self.channels)
 
     @property
+    def is_delayed(self) -> bool:
+        """Whether an input acts after a dead time, given or free."""
+        return any(isinstance(channel, Delayed) for channel in self.channels)
+
+    @property
     def has_feedback(self) -> bool:
         """Whether a static layer's output comes back to an earlier layer."""
         return any(w.feedback for w in self.wires)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 import pyro_dynogp as dgp
 from pyro_dynogp import effects
@@ -22,6 +23,7 @@ from pyro_dynogp.inference.methods.base import Problem
 from pyro_dynogp.inference.refit import race, refit
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.extended import extended_starts
+from pyro_dynogp.inference.starts.linear import fresh_starts
 from pyro_dynogp.models.delays import longest_delay, unknown_beginning
 from pyro_dynogp.models.variants import (
     with_channel,
@@ -111,12 +113,35 @@ def test_with_steps_the_most_probable_start_of_a_linear_model_climbs_alone(
     potential = Potential(problem.target, (problem.records,), starts[0])
     # The base has learnt its gains without the delay: least squares are nearer.
     assert potential.log_joint(starts[0]) > potential.log_joint(starts[-1]) + 10.0
+    fresh: list[dict[str, torch.Tensor]] = []
+    monkeypatch.setattr(refits, "fresh_starts", lambda *given: fresh)
     refit(base, record, model=model, run=replace(RUN, steps=1))
     ((optimizer, (start,)),) = calls
     assert optimizer == "gauss-newton"
     assert start is starts[0]
     refit(base, record, model=model, run=RUN)
     assert len(calls[1][1]) == len(starts)
+    fresh += starts[:1]
+    refit(base, record, model=model, run=RUN)
+    assert len(calls[2][1]) == len(starts) + 1
+
+
+@pytest.mark.parametrize(
+    ("model", "alone", "compared"),
+    [
+        (MODEL, False, False),
+        (later(LATE), True, True),  # learnt poles have imitated the dead time
+        (dgp.LinearDynamicGP(1, pairs=2), True, False),
+        (dgp.LinearDynamicGP(1, pairs=1, integrators=1), True, False),
+    ],
+)
+def test_which_linear_models_have_starts_of_a_first_fit_as_well(record, model, alone, compared):
+    problem = Problem.of(model, record)
+    for expected, variants in ((alone, False), (compared, True)):
+        found = fresh_starts(MODEL, problem.target, problem.records, 0, variants)
+        assert bool(found) == expected
+    # A dead time that there is already is learnt.
+    assert not fresh_starts(later(2 * LATE), problem.target, problem.records, 0, True)
 
 
 def test_a_function_more_is_climbed_by_adam_from_what_is_learnt(monkeypatch, record, base):

@@ -106,7 +106,7 @@ def test_the_mode_of_a_fit(map_fit, svi_fit, layered_fit):
 
 ROBUST = dgp.Wiener(1, likelihood=dgp.StudentT())
 LIMITED = dgp.Cascade(1, (dgp.Dynamic(), dgp.Static(mean="linear", limits=(0.0, None))))
-NEWTON, OTHER = [2, 2, 2, 2, 12, 12, 12], [8, 8, 8, 8, 32, 32, 32]
+NEWTON, OTHER = [14, 14, 14, 14, 20, 20, 20], [8, 8, 8, 8, 32, 32, 32]
 
 
 @pytest.mark.parametrize(
@@ -114,7 +114,7 @@ NEWTON, OTHER = [2, 2, 2, 2, 12, 12, 12], [8, 8, 8, 8, 32, 32, 32]
     [
         (dgp.LinearDynamicGP(1), dgp.LinearDynamicGP(1), NEWTON),
         (dgp.Wiener(1), dgp.Wiener(1), NEWTON),
-        (dgp.LinearDynamicGP(1), dgp.Wiener(1), [8, 8, 8, 8, 12, 12, 12]),  # Adam first
+        (dgp.LinearDynamicGP(1), dgp.Wiener(1), [8, 8, 8, 8, 20, 20, 20]),  # Adam first
         (dgp.LinearDynamicGP(1), dgp.NonlinearFeedback(1), NEWTON),
         (ROBUST, ROBUST, NEWTON),
         (LIMITED, LIMITED, OTHER),

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import pyro_dynogp as dgp
 from pyro_dynogp.data.channels import Delayed, Recorded
+from pyro_dynogp.discrepancy.held_out import forecast_errors
 from pyro_dynogp.discrepancy.residuals import residuals_of
+from pyro_dynogp.inference.log_joint import Direct
+from pyro_dynogp.inference.refit import refit
 from pyro_dynogp.models.delays import (
     comparable,
     longest_delay,
@@ -15,6 +20,7 @@ from pyro_dynogp.models.delays import (
     where_inputs_are_known,
 )
 from pyro_dynogp.models.variants import with_channel
+from tests.discrepancy.machines import machine
 from tests.discrepancy.made import coloured, fitted_mode
 from tests.discrepancy.plant_dynamics import System, response
 
@@ -53,6 +59,27 @@ def test_outputs_are_missing_until_the_first_input_arrives(record: dgp.Record) -
     assert comparable(record, [MODEL, MODEL]) is record
     assert comparable(record, [later(3), later(3)], 1.3) is record  # all of them lose the same
     assert np.isnan(comparable(record, [MODEL, later(10)], 1.3).outputs[:13]).all()
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_what_acted_before_the_record_is_unknown_for_as_long_as_it_arrives(again: bool) -> None:
+    """Three tanks, 28 samples late: no held first value drives them to where outputs count.
+
+    Forecasts were off by ten times the noise.
+    """
+    plant = machine("tanks", 29, effects=("dead time",), strength="strong")
+    record, late = plant.record[: plant.training], 28
+    plain = replace(plant.model, scaling=None)
+    model = with_channel(plain, Delayed("inflow", late * record.sampling_time))
+    fit = fitted_mode(plain if again else model, record)
+    fit = refit(fit, record, model=model) if again else fit
+    assert int(np.isnan(fit.records[0].outputs).sum()) == late
+    (begun,) = Direct(fit.model.collapsed, fit.records).records
+    assert len(begun) == len(record) - late
+    np.testing.assert_allclose(begun.inputs[:, 0], record.inputs[:-late, 0], atol=1e-9)
+    known = plant.record[: plant.training + 160]
+    error, _ = forecast_errors(fit, known, np.arange(len(known)) >= plant.training)
+    assert np.sqrt(np.nanmean(error**2)) < 1.2 * plant.noise_sd[0]
 
 
 def test_a_late_input_does_not_spoil_the_poles(record: dgp.Record) -> None:

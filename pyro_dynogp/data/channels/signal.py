@@ -63,9 +63,9 @@ class Delayed(Replacement):
     later and another dead time would be one and the same. The output of a plant that answers within
     a step moves at the next sample, and its dead time comes out up to a step shorter.
 
-    Before the record its first value is held, which is not what acted then. `fit` of a model with a
-    free dead time, and `close_loop`, take outputs for missing until the first input of the record
-    has arrived; with a given delay they had better be NaN in a record for `fit`.
+    Before the record its first value is held, which is not what acted then. `fit` and `close_loop`
+    take outputs for missing until the first input of the record has arrived, and the state of the
+    dynamics for unknown then.
 
     A given delay averages the input over each step: exact for whole numbers of steps; between them
     right for systems that are slow beside a step. A free one is exact for a dynamic layer that sees

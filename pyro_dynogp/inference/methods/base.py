@@ -15,6 +15,7 @@ from pyro_dynogp.inference.fitted import Fitted
 from pyro_dynogp.inference.posteriors import Posterior
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.inference.starts.delays import without_unknown
+from pyro_dynogp.models.delays import longest_delay, where_inputs_are_known
 from pyro_dynogp.models.model import Model
 from pyro_dynogp.models.prepared import PreparedRecord, as_measured
 from pyro_dynogp.support.errors import invalid
@@ -50,13 +51,14 @@ class Problem:
     ) -> Problem:
         """Records checked and prepared, the model in their units; `start` is a fit to start from.
 
-        With `units` the model is in these. Of a model with free dead times outputs are missing
-        until inputs are likely to have arrived.
+        With `units` the model is in these. Of a model with dead times outputs are missing until
+        inputs have arrived, or, where dead times are free, are likely to.
 
         Raises:
             ValueError: as of `Model.check`; on constant or entirely missing signals.
         """
-        checked = model.check(records)
+        dead_time = longest_delay(model)
+        checked = [where_inputs_are_known(record, dead_time) for record in model.check(records)]
         longest = max(map(len, checked))
         if longest < FEWEST:
             expected = f"a record of {FEWEST} samples or more to fit to"

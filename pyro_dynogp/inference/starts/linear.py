@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import zip_longest
 
+from pyro_dynogp.data.channels import Delayed
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.optimise.maximum import maximise, optimizer_for
 from pyro_dynogp.inference.run import Run
@@ -104,3 +105,26 @@ def linear_starts(
     random = starting_values(model, records, count=count or RANDOM, seed=seed)
     both = [one for pair in zip_longest(subspace, random) for one in pair if one is not None]
     return both[:count]
+
+
+def fresh_starts(
+    base: Model, model: Model, records: Sequence[PreparedRecord], seed: int, compared: bool
+) -> list[Values]:
+    """Starts of a first fit that a linear model has beside what its base has learnt, if any.
+
+    With a dead time more, which learnt poles have imitated; and with more poles, as what is new may
+    take the place of what is learnt.
+
+    Args:
+        base: linear. model: that extends it. records: to which it is fitted. seed: of random poles.
+        compared: whether it is one of several variants: of more poles their order is the same
+            without.
+    """
+    later = _dead_times(model) > _dead_times(base)
+    before, after = (one.dynamic[0][1] for one in (base, model))
+    more = after.pairs > before.pairs or after.integrators > before.integrators
+    return linear_starts(model, records, None, seed) if later or (more and not compared) else []
+
+
+def _dead_times(model: Model) -> int:
+    return sum(isinstance(channel, Delayed) for channel in model.channels)
