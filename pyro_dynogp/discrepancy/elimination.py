@@ -14,7 +14,7 @@ from pyro_dynogp.discrepancy.result import Attempt, EffectTest
 from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.fitting import Fit
 from pyro_dynogp.inference.bayes_factor import log_bayes_factor
-from pyro_dynogp.models.variants import Model, without_channels_of
+from pyro_dynogp.models.variants import Model, without_change_of
 from pyro_dynogp.statistics.evidence import Residuals
 from pyro_dynogp.statistics.settings import LoopSettings
 
@@ -40,7 +40,7 @@ Refit = Callable[[Fit, Model], Fit]
 
 
 def without(added: Sequence[Added], place: int, refit: Refit) -> list[Added] | None:
-    """The others, fitted without the channels that one adds; None where it adds anything else.
+    """The others, fitted without the channels and poles that one adds; None where it adds others.
 
     Each that came later extends what was there before it.
 
@@ -52,7 +52,7 @@ def without(added: Sequence[Added], place: int, refit: Refit) -> list[Added] | N
 
     def reduced(model: Model) -> Model | None:
         own = replace(model, scaling=None)
-        return without_channels_of(own, gone.model or own, gone.before)
+        return without_change_of(own, gone.model or own, gone.before)
 
     left, base, smaller = list(added[:place]), added[place].base, []
     for one in added[place + 1 :]:

@@ -6,6 +6,8 @@ import functools
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
+import numpy as np
+
 from pyro_dynogp.data.channels import Channel, count_direct
 from pyro_dynogp.layers.noise import Likelihood
 from pyro_dynogp.models.layer import INDUCING
@@ -76,11 +78,11 @@ def with_channels_of(model: Model, other: Model, base: Model) -> Model | None:
     return with_channels(model, added) if added and with_channels(base, added) == other else None
 
 
-def without_channels_of(model: Model, other: Model, base: Model) -> Model | None:
-    """The model without the channels that another one adds to a base.
+def without_change_of(model: Model, other: Model, base: Model) -> Model | None:
+    """The model without the channels and poles that another one adds to a base.
 
     None where that one adds none or differs in more than them, and where the model lacks one of
-    them, or has another that is made from it.
+    them, or has another channel that is made from one.
     """
     added = [channel for channel in other.channels if channel not in base.channels]
     made = {name for channel in added for name in channel.names}
@@ -89,9 +91,29 @@ def without_channels_of(model: Model, other: Model, base: Model) -> Model | None
         return None
     if made & {value for one in kept for value in vars(one).values() if isinstance(value, str)}:
         return None
+    more = {wire.name: _poles(layer) - _poles_of(base, wire) for wire, layer in other.dynamic}
     for channel in added:
         other, model = without_channel(other, channel), without_channel(model, channel)
-    return model if added and other == base else None
+    there = all((_poles_of(model, wire) >= _poles(layer)).all() for wire, layer in other.dynamic)
+    if not there or not (added or any(count.any() for count in more.values())):
+        return None
+
+    def less(wire: Wire, layer: Dynamic) -> Dynamic:
+        pairs, integrators = _poles(layer) - more.get(wire.name, 0)
+        return replace(layer, pairs=int(pairs), integrators=int(integrators))
+
+    return with_dynamics(model, less) if with_dynamics(other, less) == base else None
+
+
+def _poles(layer: Dynamic) -> np.ndarray:
+    """Pairs and integrators."""
+    return np.array([layer.pairs, layer.integrators])
+
+
+def _poles_of(model: Model, wire: Wire) -> np.ndarray:
+    """The same of the layer with the name of another, none where there is none."""
+    same = (_poles(layer) for own, layer in model.dynamic if own.name == wire.name)
+    return next(same, np.zeros(2))
 
 
 def with_dynamics(model: Model, change: Callable[[Wire, Dynamic], Dynamic]) -> Model:

@@ -22,7 +22,13 @@ from pyro_dynogp.discrepancy.result import Attempt, EffectTest
 from pyro_dynogp.discrepancy.search import Found
 from pyro_dynogp.discrepancy.state import SearchState
 from pyro_dynogp.inference.refit import refit
-from pyro_dynogp.models.variants import with_channel, with_pairs, without_channels_of
+from pyro_dynogp.models.feedback_variants import with_feedback
+from pyro_dynogp.models.variants import (
+    with_channel,
+    with_integrator,
+    with_pairs,
+    without_change_of,
+)
 from pyro_dynogp.statistics.evidence import Evidence
 
 from .made import SETTINGS, lag
@@ -100,17 +106,31 @@ def test_a_shift_that_an_input_explains_is_taken_out_again(jump: float, superflu
 
 def test_what_later_effects_build_on_stays() -> None:
     other = with_channel(SHIFTED, FLOW)
-    assert without_channels_of(other, SHIFTED, MODEL) == with_channel(MODEL, FLOW)
-    assert without_channels_of(MODEL, SHIFTED, MODEL) is None  # there is none
-    assert without_channels_of(SHIFTED, MODEL, MODEL) is None  # it added none
+    assert without_change_of(other, SHIFTED, MODEL) == with_channel(MODEL, FLOW)
+    assert without_change_of(MODEL, SHIFTED, MODEL) is None  # there is none
+    assert without_change_of(SHIFTED, MODEL, MODEL) is None  # it added none
     wider = with_pairs(SHIFTED, 1)
-    assert without_channels_of(wider, wider, MODEL) is None  # and another pair
+    assert without_change_of(wider, wider, MODEL) == MODEL  # and another pair
+    assert without_change_of(SHIFTED, wider, MODEL) is None  # which that has not
+    integrating = with_integrator(MODEL)
+    assert integrating is not None
+    shifted = with_channel(integrating, SHIFT)
+    assert without_change_of(shifted, integrating, MODEL) == SHIFTED
+    assert without_change_of(with_pairs(shifted, 2), integrating, MODEL) == with_pairs(SHIFTED, 2)
+    assert without_change_of(with_pairs(shifted, 2), with_pairs(MODEL, 1), MODEL) == (
+        with_pairs(shifted, 1)
+    )
+    acting = with_feedback(SHIFTED)
+    assert acting is not None
+    assert without_change_of(acting, SHIFTED, MODEL) == with_feedback(MODEL)
+    assert without_change_of(acting, with_feedback(MODEL), MODEL) is None  # a layer more
+    assert without_change_of(SHIFTED, replace(SHIFTED, initial_state="zero"), MODEL) is None
     (name,) = FLOW.names
     flow = with_channel(MODEL, FLOW)
     late = with_channel(flow, Delayed(name, 0.3))
-    assert without_channels_of(late, flow, MODEL) is None
+    assert without_change_of(late, flow, MODEL) is None
     product = with_channel(flow, Product("u", name, 0.0, 0.0))
-    assert without_channels_of(product, flow, MODEL) is None
+    assert without_change_of(product, flow, MODEL) is None
     one, later = found(effects.ExtraInput()), found(effects.DeadTime())
     fits = [SimpleNamespace(model=model) for model in (MODEL, flow, late)]
     added = [
