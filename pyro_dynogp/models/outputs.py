@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from torch import Tensor
-
 from pyro_dynogp.models.draws import JointState
 from pyro_dynogp.models.exact_outputs import ExactOutputs, has_exact_density
+from pyro_dynogp.models.late_outputs import LateOutputs
 from pyro_dynogp.models.moment_outputs import MomentOutputs
 from pyro_dynogp.models.output_process import OutputProcess
 from pyro_dynogp.models.prepared import PreparedRecord
@@ -23,16 +22,14 @@ def output_process(
     record: PreparedRecord,
     *,
     start: JointState | None = None,
-    noise_sd: Tensor | None = None,
 ) -> OutputProcess:
     """Measured outputs of a system along a record.
 
     Args:
         system: at the beginning of the record. record: times and inputs.
         start: state at the first time, where it is not what the system says.
-        noise_sd: (*b, n, n_y) of scaled outputs, where noise depends on more than the record.
     """
-    process = engine_for(system, start)(system, record, start)
-    if noise_sd is not None:
-        process.noise_sd = noise_sd
-    return process
+    engine = engine_for(system, start)
+    if start is None and record.arrived:
+        return LateOutputs(system, record, engine)
+    return engine(system, record, start)

@@ -40,6 +40,7 @@ class PreparedRecord:
         scaled_inputs: the same in standard deviations of the training record.
         observations: y (n,) of one output, (n, n_y) of several [output]; NaN where missing.
         around: inputs before and after it, where they are known: late ones come from there.
+        delayed: whether an input acts after a dead time: nothing is known of the state before.
     """
 
     record: Record
@@ -49,6 +50,7 @@ class PreparedRecord:
     scaled_inputs: Tensor
     observations: Tensor
     around: Surroundings | None = None
+    delayed: bool = False
 
     @classmethod
     def of(cls, record: Record, scaling: Scaling) -> PreparedRecord:
@@ -72,14 +74,23 @@ class PreparedRecord:
         As the density of a model with dead times has it: what acted before the record is not in it,
         and nothing is known of the state until all that has arrived.
         """
-        measured = ~torch.isnan(self.observations).reshape(len(self), -1).all(-1)
-        first = int(measured.to(torch.int8).argmax())
+        first = self._first_measured
         if not first:
             return self
         time, inputs, before = self.surroundings
         return replace(
             self._part(slice(first, None)), around=Surroundings(time, inputs, before + first)
         )
+
+    @property
+    def arrived(self) -> int:
+        """Samples before the first measured output where an input is delayed; else none."""
+        return self._first_measured if self.delayed and self.has_outputs else 0
+
+    @property
+    def _first_measured(self) -> int:
+        measured = ~torch.isnan(self.observations).reshape(len(self), -1).all(-1)
+        return int(measured.to(torch.int8).argmax())
 
     def head(self, count: int) -> PreparedRecord:
         """Its first samples."""

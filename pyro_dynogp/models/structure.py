@@ -302,7 +302,9 @@ class Structure:
             return tuple(ready)
         checked = self.check(cast(Record | Sequence[Record], records))
         scaling = self.scaling or Scaling.from_records(checked)
-        return tuple(PreparedRecord.of(record, scaling) for record in checked)
+        delayed = self.is_delayed and not self.state_sites
+        ready = [PreparedRecord.of(record, scaling) for record in checked]
+        return tuple(replace(record, delayed=delayed) for record in ready)
 
 
 def _check_feedback(integrate: Integrate, likelihood: Likelihood) -> None:

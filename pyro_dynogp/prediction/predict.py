@@ -14,7 +14,7 @@ from pyro_dynogp.models.draws import JointState, first_state, variance_multiples
 from pyro_dynogp.models.exact_outputs import ExactOutputs, spread_evenly
 from pyro_dynogp.models.late_systems import arrive
 from pyro_dynogp.models.output_process import OutputProcess, flat
-from pyro_dynogp.models.outputs import output_process
+from pyro_dynogp.models.outputs import engine_for, output_process
 from pyro_dynogp.models.prepared import PreparedRecord, with_outputs
 from pyro_dynogp.prediction.first_state import States, beginning, estimated, unknown_beginning
 from pyro_dynogp.prediction.free_run_variance import with_held_parameters
@@ -222,7 +222,7 @@ def predict(
         "state": variance.mean(0),
         "measurement noise": float(shares @ multiples) * noise.mean(0),
     }
-    exact = isinstance(outputs, ExactOutputs)
+    exact = engine_for(outputs.system) is ExactOutputs
     # Errors one step ahead are innovations, independent of each other.
     joint = exact and (horizon > 1 or fit.model.several_outputs or record.missing.any())
 

@@ -69,7 +69,10 @@ def _together(
     both = joined(first, second, future.time[0] - past.time[-1] - gap)
     inputs = np.split(fit.model.check(both)[0].inputs, [len(past)])
     before, after = (
-        PreparedRecord.of(dataclasses.replace(part.record, inputs=u), part.scaling)
+        dataclasses.replace(
+            PreparedRecord.of(dataclasses.replace(part.record, inputs=u), part.scaling),
+            delayed=part.delayed,
+        )
         for part, u in zip((before, after), inputs, strict=True)
     )
     return before, after
