@@ -45,10 +45,10 @@ LINES = 31_500
 # and first states that are estimated once (60 lines), and candidates that diverge unheard (60
 # lines), and functions in feedback that are not tried beside what leaves noise
 # alone (50 lines), and forecasts that miss where no test is certain (80 lines), and the uncertainty
-# of parameters beside coloured errors (70 lines), and climbs and variants side by side, and starts
-# and densities of models with given dead times (180 lines).
+# of parameters beside coloured errors (70 lines), and climbs and variants side by side, and starts,
+# densities and verbs of models with dead times (310 lines).
 # To shrink.
-LINES_TODAY = 55_980
+LINES_TODAY = 56_105
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()
