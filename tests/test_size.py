@@ -48,7 +48,7 @@ LINES = 31_500
 # of parameters beside coloured errors (70 lines), and climbs and variants side by side, and starts,
 # densities and verbs of models with dead times (310 lines).
 # To shrink.
-LINES_TODAY = 56_105
+LINES_TODAY = 56_110
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

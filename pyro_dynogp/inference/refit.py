@@ -243,7 +243,7 @@ def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
     line (a sensor that reports a size) the linear fit is any of several poor optima: such a model
     starts from linear fits of its own, too; a function in feedback from what is learnt, where
     nothing comes back as yet, and one of hidden signals that has no place from both. Real poles
-    take over nothing from pairs.
+    take over nothing from pairs. Some linear models have `fresh_starts`, too.
 
     Process noise that has explained what the smaller model lacks keeps the larger one from it: one
     climb goes without any first, and takes that of a fresh start then. Not where variants are
@@ -277,7 +277,8 @@ def _climbed(fit: Fitted, problem: Problem, run: Run) -> list[Optimum]:
                      steps=run.steps or ADDED_STEPS[optimizer])  # fmt: skip
     if target.is_linear:
         compared = bool(run.steps)
-        starts = [*fresh_starts(fit.model, target, records, run.seed, compared), *starts]
+        fresh = fresh_starts(fit.model, target, records, run.seed, compared=compared)
+        starts = [*fresh, *starts]
     if run.steps:  # a few, to compare variants
         return climbed(target, [most_probable(target, records, starts)], run.steps)
     if target.is_linear:

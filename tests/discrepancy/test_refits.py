@@ -114,7 +114,7 @@ def test_with_steps_the_most_probable_start_of_a_linear_model_climbs_alone(
     # The base has learnt its gains without the delay: least squares are nearer.
     assert potential.log_joint(starts[0]) > potential.log_joint(starts[-1]) + 10.0
     fresh: list[dict[str, torch.Tensor]] = []
-    monkeypatch.setattr(refits, "fresh_starts", lambda *given: fresh)
+    monkeypatch.setattr(refits, "fresh_starts", lambda *given, compared: fresh)
     refit(base, record, model=model, run=replace(RUN, steps=1))
     ((optimizer, (start,)),) = calls
     assert optimizer == "gauss-newton"
@@ -138,10 +138,11 @@ def test_with_steps_the_most_probable_start_of_a_linear_model_climbs_alone(
 def test_which_linear_models_have_starts_of_a_first_fit_as_well(record, model, alone, compared):
     problem = Problem.of(model, record)
     for expected, variants in ((alone, False), (compared, True)):
-        found = fresh_starts(MODEL, problem.target, problem.records, 0, variants)
+        found = fresh_starts(MODEL, problem.target, problem.records, 0, compared=variants)
         assert bool(found) == expected
     # A dead time that there is already is learnt.
-    assert not fresh_starts(later(2 * LATE), problem.target, problem.records, 0, True)
+    late = later(2 * LATE)
+    assert not fresh_starts(late, problem.target, problem.records, 0, compared=True)
 
 
 def test_a_function_more_is_climbed_by_adam_from_what_is_learnt(monkeypatch, record, base):

@@ -108,7 +108,7 @@ def linear_starts(
 
 
 def fresh_starts(
-    base: Model, model: Model, records: Sequence[PreparedRecord], seed: int, compared: bool
+    base: Model, model: Model, records: Sequence[PreparedRecord], seed: int, *, compared: bool
 ) -> list[Values]:
     """Starts of a first fit that a linear model has beside what its base has learnt, if any.
 
