@@ -110,12 +110,12 @@ class Refits:
             )
             done.update(zip(some, tried, strict=True))
         # Trials that take most of the time have all processors, one after the other.
-        label = f"variants, round {self.number}" if self.progress else ""
+        over_variants = f"variants, round {self.number}" if self.progress else ""
         for key in long:
             if is_late():
                 break
             (done[key],) = parallel_map(
-                lambda trial: run(trial, workers, label), [tasks[key]], workers=1
+                lambda trial: run(trial, workers, over_variants), [tasks[key]], workers=1
             )
         return {key: done[key] for key in tasks if key in done}
 

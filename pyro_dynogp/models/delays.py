@@ -11,7 +11,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pyro_dynogp.data.channels import Delayed
 from pyro_dynogp.data.record import Record
 from pyro_dynogp.models.variants import Model
 
@@ -21,7 +20,7 @@ def longest_delay(*models: Model) -> float:
 
     `fit` leaves out what it has to where the delay is a parameter.
     """
-    late = [c for model in models for c in model.channels if isinstance(c, Delayed)]
+    late = [c for model in models for c in model.delayed]
     return max([0.0, *(c.delay for c in late if c.delay is not None)])
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -12,6 +14,8 @@ from pyro_dynogp.models.draws import JointState
 from pyro_dynogp.models.output_process import LayerMoments, OutputProcess
 from pyro_dynogp.models.prepared import PreparedRecord
 from pyro_dynogp.models.system import System
+
+Found = TypeVar("Found")
 
 
 class LateOutputs(OutputProcess):
@@ -36,10 +40,14 @@ class LateOutputs(OutputProcess):
         dim = -2 if self.several else -1
         return y.narrow(dim, 0, self.first), y.narrow(dim, self.first, y.shape[dim] - self.first)
 
+    def _each(self, of: Callable[[OutputProcess, Tensor], Found], y: Tensor) -> list[Found]:
+        """What both parts say, each of its own outputs."""
+        parts = zip((self.before, self.known), self._split(y), strict=True)
+        return [of(part, own) for part, own in parts]
+
     def _moments(self, of: Callable[[OutputProcess, Tensor], Moments], y: Tensor) -> Moments:
         """What both parts say, one after the other."""
-        parts = zip((self.before, self.known), self._split(y), strict=True)
-        found = [of(part, own) for part, own in parts]
+        found = self._each(of, y)
         return Moments(
             torch.cat([one.mean for one in found], -2),
             torch.cat([one.variance for one in found], -2),
@@ -52,8 +60,7 @@ class LateOutputs(OutputProcess):
 
     def innovations(self, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """See `OutputProcess`."""
-        parts = zip((self.before, self.known), self._split(y), strict=True)
-        both = zip(*(part.innovations(own) for part, own in parts), strict=True)
+        both = zip(*self._each(lambda part, own: part.innovations(own), y), strict=True)
         error, variance, rest = (torch.cat(x, -2 if self.several else -1) for x in both)
         return error, variance, rest
 
@@ -71,8 +78,7 @@ class LateOutputs(OutputProcess):
 
     def prediction_errors(self, y: Tensor, horizon: int, count: int) -> Tensor | None:
         """See `OutputProcess`."""
-        parts = zip((self.before, self.known), self._split(y), strict=True)
-        found = [part.prediction_errors(own, horizon, count) for part, own in parts]
+        found = self._each(lambda part, own: part.prediction_errors(own, horizon, count), y)
         drawn = [errors for errors in found if errors is not None]
         return torch.cat(drawn, -2) if len(drawn) == len(found) else None
 
@@ -81,16 +87,13 @@ class LateOutputs(OutputProcess):
         if y is None:
             before, after = self.before.smooth(None), self.known.smooth(None)
         else:
-            early, late = self._split(y)
-            before, after = self.before.smooth(early), self.known.smooth(late)
+            before, after = self._each(lambda part, own: part.smooth(own), y)
         return {
             name: LayerMoments(
-                *(
-                    torch.cat([torch.from_numpy(x), torch.from_numpy(z)], -2).numpy()
-                    for x, z in ((before[name].mean, one.mean), (before[name].sd, one.sd))
-                )
+                np.concatenate([before[name].mean, late.mean], -2),
+                np.concatenate([before[name].sd, late.sd], -2),
             )
-            for name, one in after.items()
+            for name, late in after.items()
         }
 
     def state_after(

@@ -275,7 +275,7 @@ class Model(Structure):
         Models without dead times, and those whose first states or trajectories are sites along the
         whole record, have all of it.
         """
-        if not self.is_delayed or self.state_sites or self.integrate != "all":
+        if not self.delayed or self.state_sites or self.integrate != "all":
             return records
         return tuple(record.begun if record.has_outputs else record for record in records)
 

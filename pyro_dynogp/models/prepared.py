@@ -53,11 +53,12 @@ class PreparedRecord:
     delayed: bool = False
 
     @classmethod
-    def of(cls, record: Record, scaling: Scaling) -> PreparedRecord:
+    def of(cls, record: Record, scaling: Scaling, *, delayed: bool = False) -> PreparedRecord:
         """From a record that is known to fit the model, its channels made."""
         signals, grid = record.tensors(), time_grid(record.time)
         scaled = scaled_inputs(signals.inputs, scaling)
-        return cls(record, scaling, grid, signals.inputs, scaled, signals.observations)
+        measured = signals.observations
+        return cls(record, scaling, grid, signals.inputs, scaled, measured, delayed=delayed)
 
     def __len__(self) -> int:
         return len(self.record)

@@ -140,9 +140,9 @@ class Structure:
         return free_delays(self.channels)
 
     @property
-    def is_delayed(self) -> bool:
-        """Whether an input acts after a dead time, given or free."""
-        return any(isinstance(channel, Delayed) for channel in self.channels)
+    def delayed(self) -> tuple[Delayed, ...]:
+        """Channels that act after a dead time, given or free."""
+        return tuple(channel for channel in self.channels if isinstance(channel, Delayed))
 
     @property
     def has_feedback(self) -> bool:
@@ -302,9 +302,8 @@ class Structure:
             return tuple(ready)
         checked = self.check(cast(Record | Sequence[Record], records))
         scaling = self.scaling or Scaling.from_records(checked)
-        delayed = self.is_delayed and not self.state_sites
-        ready = [PreparedRecord.of(record, scaling) for record in checked]
-        return tuple(replace(record, delayed=delayed) for record in ready)
+        delayed = bool(self.delayed) and not self.state_sites
+        return tuple(PreparedRecord.of(record, scaling, delayed=delayed) for record in checked)
 
 
 def _check_feedback(integrate: Integrate, likelihood: Likelihood) -> None:

@@ -69,9 +69,8 @@ def _together(
     both = joined(first, second, future.time[0] - past.time[-1] - gap)
     inputs = np.split(fit.model.check(both)[0].inputs, [len(past)])
     before, after = (
-        dataclasses.replace(
-            PreparedRecord.of(dataclasses.replace(part.record, inputs=u), part.scaling),
-            delayed=part.delayed,
+        PreparedRecord.of(
+            dataclasses.replace(part.record, inputs=u), part.scaling, delayed=part.delayed
         )
         for part, u in zip((before, after), inputs, strict=True)
     )

@@ -138,6 +138,7 @@ def test_with_a_limit_refits_begin_as_many_at_a_time_as_there_are_workers(
     def run(answers: list[bool] | None) -> tuple[Any, Any]:
         late = None if answers is None else iter(answers).__next__
         one = SimpleNamespace(number=1, workers=2, progress=False, late=late, early=False)
+        # A stand-in has all that the method asks for, and is no `Refits`.
         return one, refits.Refits.run(one, tasks, "refits")  # type: ignore[arg-type]
 
     one, done = run([False, False, True])

@@ -152,9 +152,9 @@ class Innovations:
 
     def energies(self, z: np.ndarray) -> np.ndarray:
         """Energies (k,) at z (k, d); infinite where there is none."""
-        *innovated, prior, _ = self.evaluate(z)
+        found = self.evaluate(z)
         with np.errstate(all="ignore"):
-            return _finite(prior + _energies(Innovated(*innovated)))
+            return _finite(found.prior + _energies(found))
 
     def local(self, z: np.ndarray) -> Local | None:
         """Energy, gradient and curvatures at z (d,), by one-sided differences; None at an edge.
@@ -162,7 +162,8 @@ class Innovations:
         Of the entries that vary.
         """
         points = np.concatenate([z[None], z + STEP * np.eye(len(z))[self.free]])
-        errors, variances, rest, prior, gradients = self.evaluate(points)
+        found = self.evaluate(points)
+        errors, variances, rest, prior, gradients = found
         with np.errstate(all="ignore"):
             sd = np.sqrt(variances[0])
             level = self._level(errors, variances, sd)
@@ -171,7 +172,7 @@ class Innovations:
             gradients = gradients[:, self.free]
             of_rest = (rest[1:] - rest[0]).sum(1) / STEP
             gradient = gradients[0] + self._slope(slopes, first[0], first[0] ** 2) - of_rest
-            energy = float(prior[0]) + float(_energies(Innovated(errors, variances, rest))[0])
+            energy = float(prior[0]) + float(_energies(found)[0])
             curvature = (gradients[1:] - gradients[0]) / STEP
             curvature = 0.5 * (curvature + curvature.T)
             fisher = sum(J @ J.T for J in slopes)
@@ -181,10 +182,10 @@ class Innovations:
 
     def beside(self, here: Local, z: np.ndarray) -> tuple[float, np.ndarray]:
         """Energy at z (d,), and its gradient with the predictions' derivatives of another point."""
-        *innovated, (prior,), (gradient,) = self.evaluate(z[None])
-        (errors,), (variances,), _ = innovated
+        found = self.evaluate(z[None])
+        (errors,), (variances,), _, (prior,), (gradient,) = found
         with np.errstate(all="ignore"):
-            energy = float(prior + _energies(Innovated(*innovated))[0])
+            energy = float(prior + _energies(found)[0])
             share = math.sqrt(self._of_mean) * errors * (here.sd / variances)
             own = self._slope(here.slopes, share, self._of_mean * errors**2 / variances)
         return energy, gradient[self.free] + own - here.rest
@@ -259,7 +260,8 @@ class Innovations:
         return Innovated(*(np.concatenate(part, axis=1) for part in zip(*found, strict=True)))
 
 
-def _energies(of: Innovated) -> np.ndarray:
+def _energies(of: Evaluated) -> np.ndarray:
+    """Of the outputs alone."""
     normal = of.error**2 / of.variance + np.log(2.0 * np.pi * of.variance)
     return np.asarray((0.5 * normal - of.rest).sum(1))
 

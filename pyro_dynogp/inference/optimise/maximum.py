@@ -17,6 +17,7 @@ from pyro_dynogp.inference.log_joint import Direct
 from pyro_dynogp.inference.optimise import gauss_newton
 from pyro_dynogp.inference.optimise.adam import RATE, adam
 from pyro_dynogp.inference.optimise.descent import descend, lbfgs, polished
+from pyro_dynogp.inference.optimise.gauss_newton import Climbed
 from pyro_dynogp.inference.optimise.innovation_energy import Innovations, has_innovations
 from pyro_dynogp.inference.optimise.lengths import Lengths
 from pyro_dynogp.inference.optimise.lockstep import Functions, in_lockstep
@@ -29,8 +30,6 @@ from pyro_dynogp.models.prepared import Records, as_measured
 from pyro_dynogp.models.variants import without_noise_below_functions
 from pyro_dynogp.support.parallel import parallel_map, seeded
 
-# End, energies on the way, why it ended.
-Climb = tuple[np.ndarray, list[float], str]
 Optimizer = Literal["gauss-newton", "lbfgs", "preconditioned", "adam"]
 # Decimals of energies [nats] to which two starts are at one optimum: the first of them is kept,
 # whatever rounding says.
@@ -93,14 +92,14 @@ class _Task:
     held: tuple[str, ...] = ()
 
 
-def _lbfgs(functions: Functions, z: np.ndarray, task: _Task, every: int) -> Climb:
+def _lbfgs(functions: Functions, z: np.ndarray, task: _Task, every: int) -> Climbed:
     del every  # of Hessians, of which it has none
     history: list[float] = []
     result = lbfgs(functions, z, task.steps, history, maxfun=2 * task.steps, ftol=1e-7)
     return result.x, history, str(result.message)
 
 
-def _preconditioned(functions: Functions, z: np.ndarray, task: _Task, every: int) -> Climb:
+def _preconditioned(functions: Functions, z: np.ndarray, task: _Task, every: int) -> Climbed:
     # A Hessian before the first iteration, unless it costs more than all of them.
     pays = task.steps >= len(z) / BATCHED
     return descend(
@@ -108,7 +107,7 @@ def _preconditioned(functions: Functions, z: np.ndarray, task: _Task, every: int
     )
 
 
-def _adam(functions: Functions, z: np.ndarray, task: _Task, every: int) -> Climb:
+def _adam(functions: Functions, z: np.ndarray, task: _Task, every: int) -> Climbed:
     del every  # of Hessians, of which it has none
     return adam(functions, z, task.steps, task.rate)
 
@@ -130,7 +129,7 @@ def _climb(task: _Task) -> list[Optimum]:
         ]
 
 
-def _climbs(potential: Potential, task: _Task) -> tuple[list[Climb], np.ndarray]:
+def _climbs(potential: Potential, task: _Task) -> tuple[list[Climbed], np.ndarray]:
     """Climbs from every start, and the energies (k,) at their ends."""
     starts = [_placed(potential, potential.pack(start).numpy()) for start in task.starts]
     held = potential.places(task.held)
@@ -149,7 +148,7 @@ def _climbs(potential: Potential, task: _Task) -> tuple[list[Climb], np.ndarray]
     else:
         method = _METHODS[task.optimizer]
 
-        def run(z: np.ndarray) -> Callable[[Functions], Climb]:
+        def run(z: np.ndarray) -> Callable[[Functions], Climbed]:
             return lambda functions: method(functions, z, task, every)
 
         found = in_lockstep(functions, [run(z) for z in starts])
@@ -161,7 +160,7 @@ def _climbs(potential: Potential, task: _Task) -> tuple[list[Climb], np.ndarray]
     return found, potential.values_and_gradients(np.stack([z for z, _, _ in found]))[0]
 
 
-def _to_the_top(functions: Functions, climb: Climb, every: int) -> Climb:
+def _to_the_top(functions: Functions, climb: Climbed, every: int) -> Climbed:
     """A climb that is all but at an end, with Newton's method from there on.
 
     Where it stops for want of 0.01 nats depends on rounding, and so on units and order of channels.
@@ -221,7 +220,7 @@ def maximise(
     held: Sequence[str] = (),
     learnt: int = 0,
 ) -> list[Optimum]:
-    """Climb from every start; the optima sorted by energy, best first.
+    """Climbed from every start; the optima sorted by energy, best first.
 
     All starts get a fifth of the steps, then the best of them the rest (successive halving: a start
     that is far behind by then hardly ever wins); by Gauss-Newton in the stages of `RANKED`. The

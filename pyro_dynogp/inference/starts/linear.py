@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import zip_longest
 
-from pyro_dynogp.data.channels import Delayed
 from pyro_dynogp.data.scaling import Scaling
 from pyro_dynogp.inference.optimise.maximum import maximise, optimizer_for
 from pyro_dynogp.inference.run import Run
@@ -120,11 +119,7 @@ def fresh_starts(
         compared: whether it is one of several variants: of more poles their order is the same
             without.
     """
-    later = _dead_times(model) > _dead_times(base)
+    later = len(model.delayed) > len(base.delayed)
     before, after = (one.dynamic[0][1] for one in (base, model))
     more = after.pairs > before.pairs or after.integrators > before.integrators
     return linear_starts(model, records, None, seed) if later or (more and not compared) else []
-
-
-def _dead_times(model: Model) -> int:
-    return sum(isinstance(channel, Delayed) for channel in model.channels)
