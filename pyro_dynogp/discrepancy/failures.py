@@ -16,6 +16,10 @@ from pyro_dynogp.models.variants import Model
 CONSTANT = 1e-12
 
 
+class TimeLimitError(Exception):
+    """The time limit has passed before a trial came to its end."""
+
+
 def why_not(
     models: Sequence[Model], record: Record, folds: Sequence[np.ndarray], error: ValueError
 ) -> str:

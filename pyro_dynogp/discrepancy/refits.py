@@ -12,10 +12,11 @@ import joblib
 import numpy as np
 
 from pyro_dynogp.data.record import Record
+from pyro_dynogp.discrepancy.failures import TimeLimitError
 from pyro_dynogp.discrepancy.judged import MORE, SPREAD, Judged, Kind, judge, kind_of
 from pyro_dynogp.discrepancy.search import Candidate, Found
 from pyro_dynogp.discrepancy.stretches import interleaved
-from pyro_dynogp.discrepancy.trials import Trial, Tried, run, with_substeps
+from pyro_dynogp.discrepancy.trials import Ahead, Trial, Tried, run, with_substeps
 from pyro_dynogp.fitting import Fit
 from pyro_dynogp.inference.bayes_factor import VERY_STRONG, log_evidence_of
 from pyro_dynogp.inference.refit import refit
@@ -110,13 +111,14 @@ class Refits:
             )
             done.update(zip(some, tried, strict=True))
         # Trials that take most of the time have all processors, one after the other.
-        over_variants = f"variants, round {self.number}" if self.progress else ""
-        for key in long:
-            if is_late():
-                break
-            (done[key],) = parallel_map(
-                lambda trial: run(trial, workers, over_variants), [tasks[key]], workers=1
-            )
+        ahead = Ahead(workers, f"variants, round {self.number}" if self.progress else "", self.late)
+        try:
+            for key in long:
+                if is_late():
+                    break
+                (done[key],) = parallel_map(lambda one: run(one, ahead), [tasks[key]], workers=1)
+        except TimeLimitError:
+            self.early = True
         return {key: done[key] for key in tasks if key in done}
 
     def judge(self, candidates: Sequence[Candidate]) -> list[Judged]:

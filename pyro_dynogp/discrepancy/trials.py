@@ -12,7 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from pyro_dynogp.data.record import Record
-from pyro_dynogp.discrepancy.failures import why_not
+from pyro_dynogp.discrepancy.failures import TimeLimitError, why_not
 from pyro_dynogp.discrepancy.held_out import (
     LITTLE_ELSE,
     are_noise,
@@ -28,7 +28,11 @@ from pyro_dynogp.inference.bayes_factor import VERY_STRONG, energy, log_bayes_fa
 from pyro_dynogp.inference.refit import race, refit, refits
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.models.delays import comparable, longest_delay
-from pyro_dynogp.models.feedback_variants import with_usual_substeps
+from pyro_dynogp.models.feedback_variants import (
+    acting_back,
+    has_other_dynamics,
+    with_usual_substeps,
+)
 from pyro_dynogp.models.variants import Model
 from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.support.parallel import parallel_map
@@ -109,19 +113,31 @@ class _Rated(NamedTuple):
     errors: np.ndarray
 
 
-def run(trial: Trial, workers: int = 1, progress: str = "") -> Tried:
+class Ahead(NamedTuple):
+    """How variants are fitted that are compared ahead; results are the same.
+
+    Attributes:
+        workers: processes. progress: label of a bar, "" for none.
+        late: says whether the time limit has passed, asked before each of them; None for none.
+    """
+
+    workers: int = 1
+    progress: str = ""
+    late: Callable[[], bool] | None = None
+
+
+def run(trial: Trial, ahead: Ahead = Ahead()) -> Tried:  # noqa: B008 - it does not change
     """Refit the variants on the first fold's training data, the best on all; score the folds.
 
-    Args:
-        trial: what to refit. workers: processes for variants that are compared ahead; results are
-            the same. progress: label of a bar over these, "" for none.
+    Raises:
+        TimeLimitError: where the time limit has passed before all variants were fitted.
     """
     begin = time.perf_counter()
     first: Fit | None = None
     parts, beside = [np.zeros(0)], [np.zeros((0, trial.record.n_outputs))]
     failure = ""
     try:
-        first = _kept(trial, without(trial.record, trial.folds[0]), workers, progress)
+        first = _kept(trial, without(trial.record, trial.folds[0]), ahead)
         for index, fold in enumerate(trial.folds):
             found = first
             if index > 0:
@@ -143,12 +159,12 @@ def run(trial: Trial, workers: int = 1, progress: str = "") -> Tried:
     )
 
 
-def _kept(trial: Trial, training: Record, workers: int, progress: str) -> Fit:
+def _kept(trial: Trial, training: Record, ahead: Ahead) -> Fit:
     """The variant that is kept, fitted to the training data."""
     if trial.fit is not None:
         return trial.fit
     if trial.is_long:
-        return _best_ahead(trial, training, workers, progress)
+        return _best_ahead(trial, training, ahead)
     (model, *others), start = trial.models, trial.base
     finer = _finer(trial, model, training, 0)
     if others or finer:
@@ -197,7 +213,7 @@ def _refined(
     return start
 
 
-def _best_ahead(trial: Trial, training: Record, workers: int, progress: str) -> Fit:
+def _best_ahead(trial: Trial, training: Record, ahead: Ahead) -> Fit:
     """The first variant, or a later one that is certainly better on the data held out.
 
     A block that goes beyond what the training data have seen says little of a shape: of shapes that
@@ -209,6 +225,7 @@ def _best_ahead(trial: Trial, training: Record, workers: int, progress: str) -> 
     are `_wanted`. Variants that cannot be fitted are left out.
     """
     fold, settings = trial.folds[0], trial.settings
+    workers, progress, late = ahead
 
     def refitted(places: Sequence[int], label: str = "") -> list[_Refitted]:
         return parallel_map(
@@ -234,10 +251,12 @@ def _best_ahead(trial: Trial, training: Record, workers: int, progress: str) -> 
             if not _wanted(trial, place, found):
                 continue
             if place not in made:
+                if late is not None and late():
+                    raise TimeLimitError
                 # What is not wanted once others are rated is dropped again.
                 later = (k for k in every[place:] if k not in made and _wanted(trial, k, found))
-                ahead = list(itertools.islice(later, workers))
-                made.update(zip(ahead, refitted(ahead), strict=True))
+                some = list(itertools.islice(later, workers))
+                made.update(zip(some, refitted(some), strict=True))
             found += rated(made[place][0])
     if not found:
         raise next(why for _, problems in made.values() for why in problems)
@@ -264,25 +283,15 @@ def _wanted(trial: Trial, place: int, found: Sequence[_Rated]) -> bool:
     model, before = trial.models[place], trial.models[:place]
     if are_noise(errors, leading):
         return False
-    if _has_other_dynamics(model) and all(
+    if has_other_dynamics(model) and all(
         are_noise(errors, fit, LITTLE_ELSE) for fit in (leading, trial.base)
     ):
         return False
-    joined = [_back(one) for one in before if _back(one) < _back(model)]
+    joined = [acting_back(one) for one in before if acting_back(one) < acting_back(model)]
     if len(joined) < 2:
         return True
     least = held_out_density(trial.base, trial.record, trial.folds[0], trial.score)
-    return bool(most.sum() > least.sum()) and _back(leading.model) in joined
-
-
-def _back(model: Model) -> set[str]:
-    """Names of what acts back on the dynamics."""
-    return {name for _, layer in model.dynamic for name in layer.feedback}
-
-
-def _has_other_dynamics(model: Model) -> bool:
-    """Whether dynamics are a chain of lags, or have more hidden signals than outputs."""
-    return any(layer.real or layer.mostly_hidden for _, layer in model.dynamic)
+    return bool(most.sum() > least.sum()) and acting_back(leading.model) in joined
 
 
 def _is_more_probable(one: Fit, best: Fit, gain: np.ndarray, settings: LoopSettings) -> bool:

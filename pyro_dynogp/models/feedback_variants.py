@@ -145,6 +145,16 @@ def with_products(model: Model, *, hidden: bool = False) -> Model | None:
     return None if extended is None else with_usual_substeps(extended)
 
 
+def acting_back(model: Model) -> set[str]:
+    """Names of what acts back on the dynamics."""
+    return {name for _, layer in model.dynamic for name in layer.feedback}
+
+
+def has_other_dynamics(model: Model) -> bool:
+    """Whether dynamics are a chain of lags, or have more hidden signals than outputs."""
+    return any(layer.real or layer.mostly_hidden for _, layer in model.dynamic)
+
+
 def noise_allows_feedback(model: Model) -> bool:
     """Whether functions may be put in feedback beside the model's measurement noise."""
     return model.likelihood.gaussian and not model.likelihood.follows_output

@@ -96,7 +96,8 @@ class MomentOutputs(OutputProcess):
         """Scaled innovations (*b, n, n_y), variances, and what log-densities have beyond normal."""
         problem = self._problem(y)
         error, variance, density = self._innovations_of(problem)
-        if lanes_serve(problem) and self.system.noise.likelihood.gaussian:
+        normal = self.system.noise.likelihood.gaussian and problem.layout.measured < 0
+        if lanes_serve(problem) and normal:
             return error, variance, torch.zeros_like(error)
         return error, variance, density - _normal_density(error, variance)
 

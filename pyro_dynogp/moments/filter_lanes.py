@@ -2,7 +2,7 @@ r"""The filter's predictions one step ahead for points in lanes, forward only; c
 
 The recursion of `smoothing.innovate`, operation by operation, for eight points at a time: what
 differences over many points (Gauss-Newton, Fisher matrices) and densities of many draws need.
-Outputs are measured through rows of their own. Only the look-up in tables goes point by point.
+Only the look-up in tables, and outputs that are a function of a signal, go point by point.
 
 The numbers of a group of points are `Values` whose arrays are lanes, the last axis being the point:
 all but tables (WIDTH, E, grid), which are looked up point by point, and y, which the points share.
@@ -11,72 +11,17 @@ all but tables (WIDTH, E, grid), which are looked up point by point, and y, whic
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
-import numpy as np
 from numba import njit
 
-from pyro_dynogp.lti.lanes import WIDTH, exponential, get, larger, put, root, splat
+from pyro_dynogp.lti.lanes import exponential, get, larger, put, root, splat
+from pyro_dynogp.moments.filtering import inner
 from pyro_dynogp.moments.function_lanes import cubic, expand, locate
 from pyro_dynogp.moments.functions import TABLE
+from pyro_dynogp.moments.lane_room import project_row, update, weighted
 from pyro_dynogp.moments.layout import FLOOR
+from pyro_dynogp.moments.measured_lanes import measure_function
 from pyro_dynogp.support.compiled import BORROWING, WITHIN
-
-
-class InUse(NamedTuple):
-    """What is not zero at every point of a group: the rest is passed over.
-
-    Attributes:
-        variance: (E,) of functions. G: (D, A), H: (n_y, A), gamma: (k, N, E), as of `Values`.
-    """
-
-    variance: np.ndarray
-    G: np.ndarray
-    H: np.ndarray
-    gamma: np.ndarray
-
-
-class Room(NamedTuple):
-    """Work arrays of lanes.
-
-    m (A), P (A A), T (N A), c (A); of one static layer centre (d), W (A d), own covariance (d d)
-    and its root (d d), a node (d), f (Q e), cross and gain (d e).
-    """
-
-    m: np.ndarray
-    P: np.ndarray
-    T: np.ndarray
-    c: np.ndarray
-    centre: np.ndarray
-    W: np.ndarray
-    square: np.ndarray
-    root: np.ndarray
-    z: np.ndarray
-    f: np.ndarray
-    cross: np.ndarray
-    gain: np.ndarray
-
-
-def room(states: int, outputs: int, channels: int, widest: int, nodes: int) -> Room:
-    """Arrays for one group.
-
-    Args:
-        states: N. outputs: E, of all static layers. channels, widest: most inputs and outputs of
-            one of them. nodes: most nodes.
-    """
-    A, d, e = states + outputs, channels, widest
-    sizes = (A, A * A, states * A, A, d, A * d, d * d, d * d, d, nodes * e, d * e, d * e)
-    return Room(*(np.zeros((max(size, 1), WIDTH)) for size in sizes))
-
-
-@njit(**WITHIN)
-def _weighted(row, first, used, x, start, stride, count):
-    """Sum of row[first + j] x[start + j stride] over the entries j of a row that are in use."""
-    total = splat(0.0)
-    for j in range(count):
-        if used[j]:
-            total = total + get(row, first + j) * get(x, start + j * stride)
-    return total
 
 
 @njit(**WITHIN)
@@ -137,9 +82,9 @@ def _project(i, time, layout, A, values, used, own):
                 mean = mean + get(values.G, row + j) * get(own.m, j)
         put(own.centre, c, mean)
         for k in range(na):
-            put(own.W, k * d + c, _weighted(values.G, row, seen, own.P, k * A, 1, na))
+            put(own.W, k * d + c, weighted(values.G, row, seen, own.P, k * A, 1, na))
         for b in range(c + 1):
-            total = _weighted(values.G, row, seen, own.W, b, d, na)
+            total = weighted(values.G, row, seen, own.W, b, d, na)
             put(own.square, c * d + b, total)
             put(own.square, b * d + c, total)
     for c in range(d):
@@ -248,12 +193,7 @@ def _measure(time, o, layout, A, values, used, own, found):
     """Use one output; what `innovate_lanes` writes goes to `found`."""
     y = values.y
     n, n_y = y.shape
-    seen = used.H[o]
-    row = o * A
-    for i in range(A):
-        put(own.c, i, _weighted(values.H, row, seen, own.P, i, A, A))
-    p = _weighted(values.H, row, seen, own.c, 0, 1, A)
-    mean = _weighted(values.H, row, seen, own.m, 0, 1, A)
+    mean, p = project_row(values.H, o, used.H[o], A, own)
     offset = get(values.y_offset, time * n_y + o)
     R = get(values.R, time * n_y + o)
     put(found, time * n_y + o, splat(y[time, o]) - (mean + offset))
@@ -269,22 +209,17 @@ def _measure(time, o, layout, A, values, used, own, found):
         put(found, (3 * n + time) * n_y + o, total)
         beta = first - r * r * (second - first * first)
         alpha = r * first
-    for i in range(A):
-        c = get(own.c, i)
-        put(own.m, i, get(own.m, i) + alpha * c)
-        t = beta * c
-        for j in range(A):
-            at = i * A + j
-            put(own.P, at, get(own.P, at) - t * get(own.c, j))
+    update(A, alpha, beta, own)
 
 
 @njit(**BORROWING)
-def innovate_lanes(layout, values, used, own, found):
+def innovate_lanes(layout, values, used, own, work, count, found):
     """Write innovations and their variances of one group to found (2, n, n_y, WIDTH).
 
     Under noise of several Gaussians, the widest first, found (4, ...) has the logarithm of a factor
-    of each density, too, and the other factor but for 1 / sqrt(2 pi). Nothing is written where y is
-    missing.
+    of each density, too, and the other factor but for 1 / sqrt(2 pi). Where the output is a
+    function of a signal, found (3, ...) has the log-densities; of the first `count` points alone.
+    `work` is a `Bench`. Nothing is written where y is missing.
     """
     n, n_y = values.y.shape
     N = values.m0.shape[0]
@@ -301,8 +236,12 @@ def innovate_lanes(layout, values, used, own, found):
         k = layout.step[time]
         if k >= 0:
             _enter(k, N, A, values, used, own)
-        for i in range(layout.channels.shape[0]):
+        for i in range(inner(layout)):
             _append(i, time, layout, A, values, used, own)
         for o in range(n_y):
-            if not math.isnan(values.y[time, o]):
+            if math.isnan(values.y[time, o]):
+                continue
+            if layout.measured >= 0:
+                measure_function(time, layout, A, values, used, own, work, count, found)
+            else:
                 _measure(time, o, layout, A, values, used, own, found)

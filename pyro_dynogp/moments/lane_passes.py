@@ -6,8 +6,10 @@ import numpy as np
 
 from pyro_dynogp.lti.lanes import WIDTH
 from pyro_dynogp.lti.primitives import array, flatten_batch
-from pyro_dynogp.moments.filter_lanes import InUse, innovate_lanes, room
+from pyro_dynogp.moments.filter_lanes import innovate_lanes
+from pyro_dynogp.moments.lane_room import InUse, room
 from pyro_dynogp.moments.layout import Values
+from pyro_dynogp.moments.nodes import Bench, bench
 from pyro_dynogp.moments.problem import EVENTS, FilterProblem, each
 
 # Points from which lanes pay: fewer leave most of them empty.
@@ -17,9 +19,8 @@ _TABLES = ("table_mean", "table_variance")
 
 
 def lanes_serve(problem: FilterProblem) -> bool:
-    """Whether points go through in lanes: several, outputs of rows, one y."""
-    rows = problem.layout.measured < 0 and problem.y.dim() == 2
-    return rows and problem.batch_shape.numel() >= FEWEST
+    """Whether points go through in lanes: several, of one y."""
+    return problem.y.dim() == 2 and problem.batch_shape.numel() >= FEWEST
 
 
 def innovate_together(problem: FilterProblem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -43,20 +44,25 @@ def innovate_together(problem: FilterProblem) -> tuple[np.ndarray, np.ndarray, n
     channels = int(layout.channels.max(initial=1))
     widest = int(layout.outputs.max(initial=1))
     N, E = parts["m0"].shape[-1], int(layout.f_start[-1])
-    gaussian = len(layout.share) == 1
+    gaussian, curved = len(layout.share) == 1, layout.measured >= 0
+    kept = 3 if curved else 2 if gaussian else 4
 
     def group(g: int) -> np.ndarray:
         rows = np.minimum(np.arange(g * WIDTH, (g + 1) * WIDTH), count - 1)
         own = room(N, E, channels, widest, layout.nodes.shape[1])
-        found = np.full((2 if gaussian else 4, *y.shape, WIDTH), np.nan)
-        innovate_lanes(layout, *_lanes(parts, rows, y), own, found)
-        return np.moveaxis(found, -1, 0)[: count - g * WIDTH]
+        found = np.full((kept, *y.shape, WIDTH), np.nan)
+        there = min(count - g * WIDTH, WIDTH)
+        work = Bench(*bench(len(layout.share)))
+        innovate_lanes(layout, *_lanes(parts, rows, y), own, work, there, found)
+        return np.moveaxis(found, -1, 0)[:there]
 
     found = np.concatenate(each(group, -(-count // WIDTH)))
     error, variance = found[:, 0], found[:, 1]
     # Where there is no density, or runs have grown without bound.
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        if gaussian:
+        if curved:
+            density = found[:, 2]
+        elif gaussian:
             density = -0.5 * (error**2 / variance + np.log(2.0 * np.pi * variance))
         else:
             density = found[:, 2] + np.log(found[:, 3]) - 0.5 * np.log(2.0 * np.pi)

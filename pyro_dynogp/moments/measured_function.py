@@ -24,13 +24,13 @@ gradients by its entries go node by node.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from pyro_dynogp.lti.lanes import WIDTH, choose, exponential, get, larger, put, root, splat, total
 from pyro_dynogp.moments.nodes import (
-    COUNT,
     LOG_WEIGHTS,
     MORE,
     NODES,
@@ -51,14 +51,32 @@ from pyro_dynogp.support.compiled import BORROWING, WITHIN
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
+class Curve(NamedTuple):
+    """A tabulated function: first point and spacing of the grid, mean and variance (grid,) there.
+
+    Attributes:
+        low, spacing, mean, variance.
+    """
+
+    low: float
+    spacing: float
+    mean: np.ndarray
+    variance: np.ndarray
+
+
 @njit(**WITHIN)
-def _evaluate(i, layout, values, centre, sd, work):
-    """Static layer i at the nodes centre + sd xi, and each component's regression line."""
-    mean = values.table_mean[layout.f_start[i]]
-    variance = values.table_variance[layout.f_start[i]]
+def curve_of(i, layout, values):
+    """That of static layer i."""
+    f = layout.f_start[i]
+    return Curve(values.low[i], values.spacing[i], values.table_mean[f], values.table_variance[f])
+
+
+@njit(**WITHIN)
+def _evaluate(curve, centre, sd, work):
+    """The function at the nodes centre + sd xi, and each component's regression line."""
     f, place, at, corner = work.curve, work.place, work.at, work.corner
-    locate(values.low[i], values.spacing[i], mean.shape[0], centre, sd, place)
-    take(mean, variance, place, corner)
+    locate(curve.low, curve.spacing, curve.mean.shape[0], centre, sd, place)
+    take(curve.mean, curve.variance, place, corner)
     for v in range(MORE):
         value, _ = cubic(corner, v, get(place, MORE + v))
         put(f, v, value)
@@ -138,7 +156,7 @@ def function_terms(i, y, R, centre, p, layout, values, work):
         i: static layer f. y: measured, without the output's known part. R: variance of the noise.
         centre, p: mean c and variance of g.
     """
-    _evaluate(i, layout, values, centre, math.sqrt(p), work)
+    _evaluate(curve_of(i, layout, values), centre, math.sqrt(p), work)
     return function_given(y, R, p, layout, work)
 
 
@@ -150,7 +168,7 @@ def function_adjoint(i, y, R, centre, p, layout, values, bars, work, alpha_bar, 
         Gradients by y, R, centre and p.
     """
     sd = math.sqrt(p)
-    _evaluate(i, layout, values, centre, sd, work)
+    _evaluate(curve_of(i, layout, values), centre, sd, work)
     _, scale, mean, variance = _weigh(y, R, layout.share, layout.multiple, work)
     beta = (1.0 - variance) / p
     # variance = second - mean^2
@@ -273,15 +291,23 @@ def function_density(y, R, layout, work):
 
 @njit(**WITHIN)
 def function_moments(i, centre, p, layout, values, work):
+    """Mean and variance of f(g) for g ~ N(centre, p), f being static layer i."""
+    return moments_of(curve_of(i, layout, values), centre, p, work)
+
+
+@njit(**WITHIN)
+def moments_of(curve, centre, p, work):
     """Mean and variance of f(g) for g ~ N(centre, p)."""
-    _evaluate(i, layout, values, centre, math.sqrt(p), work)
-    f, at = work.curve, work.at
-    mean = 0.0
-    for q in range(COUNT):
-        mean += STANDARD[q] * f[q + 2]
-    variance = 0.0
-    for q in range(COUNT):
-        off = f[q + 2] - mean
-        bend = f[q] - 2.0 * f[q + 2] + f[q + 4]
-        variance += STANDARD[q] * (off * off + at[1, q] - bend * bend / 18.0)
-    return mean, variance
+    _evaluate(curve, centre, math.sqrt(p), work)
+    early, f, late, at = work.curve, work.curve[2:], work.curve[4:], work.at
+    first = splat(0.0)
+    for v in range(VECTORS):
+        first = first + get(STANDARD, v) * get(f, v)
+    mean = total(first)
+    second = splat(0.0)
+    for v in range(VECTORS):
+        off = get(f, v) - splat(mean)
+        bend = get(early, v) - splat(2.0) * get(f, v) + get(late, v)
+        own = off * off + get(at, VECTORS + v) - bend * bend * splat(1.0 / 18.0)
+        second = second + get(STANDARD, v) * own
+    return mean, total(second)

@@ -6,6 +6,7 @@ Only the look-up in the table goes node by node.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -39,6 +40,19 @@ def _log_weights(variance: float) -> np.ndarray:
 # Of the components, and of the standard normal distribution itself.
 LOG_WEIGHTS = _log_weights(1.0 - SQUARE)
 STANDARD = np.exp(_log_weights(1.0))
+
+
+class Bench(NamedTuple):
+    """Work arrays of `measured_function`, as `bench` makes them."""
+
+    curve: np.ndarray
+    place: np.ndarray
+    corner: np.ndarray
+    at: np.ndarray
+    weights: np.ndarray
+    inverses: np.ndarray
+    curve_bar: np.ndarray
+    lanes: np.ndarray
 
 
 @njit(**OPTIONS)

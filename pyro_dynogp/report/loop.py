@@ -84,9 +84,9 @@ def close_loop(
         settings: every other threshold; None for the defaults of `LoopSettings`.
         workers: processes; None for all processors, or the cluster of
             ``joblib.parallel_config``. progress: whether to show progress bars.
-        time_limit: of the search [s]; None for none. No round, and no refit, begins after it; a
-            round that it cuts short adds nothing. Last fits and scores come after it, and the
-            report says what was not tried.
+        time_limit: of the search [s]; None for none. No round, no refit and no variant of one
+            begins after it; a round that it cuts short adds nothing. Last fits and scores come
+            after it, and the report says what was not tried.
 
     Raises:
         ValueError: on blocks that are too short, unknown candidates, numbers that make no sense.

@@ -129,7 +129,7 @@ def test_with_a_limit_refits_begin_as_many_at_a_time_as_there_are_workers(
 
     monkeypatch.setattr(refits, "parallel_map", several)
     monkeypatch.setattr(
-        refits, "run", lambda trial, workers, bar: f"{trial.name}, {workers} at a time"
+        refits, "run", lambda trial, ahead: f"{trial.name}, {ahead.workers} at a time"
     )
     tasks: dict[str, Any] = {
         name: SimpleNamespace(name=name, is_long=name in "bf") for name in "abcdefg"
@@ -171,3 +171,22 @@ def test_a_comparison_on_one_scale_that_is_cut_short_decides_nothing() -> None:
     assert found.early
     assert found.winner is None
     assert [one.decision for one in found.attempts] == ["undecided", "undecided"]
+
+
+def test_a_trial_that_the_limit_ends_has_no_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is passed on to what compares variants, which asks before each."""
+    asked: list[str] = []
+
+    def ended(trial: Any, ahead: Any) -> Any:
+        asked.append(trial.name)
+        if trial.name == "b":
+            raise refits.TimeLimitError
+        assert not ahead.late()
+        return trial.name
+
+    monkeypatch.setattr(refits, "run", ended)
+    tasks: dict[str, Any] = {name: SimpleNamespace(name=name, is_long=True) for name in "abc"}
+    one = SimpleNamespace(number=1, workers=1, progress=False, late=lambda: False, early=False)
+    assert refits.Refits.run(one, tasks, "refits") == {"a": "a"}  # type: ignore[arg-type]
+    assert asked == ["a", "b"]
+    assert one.early

@@ -12,6 +12,7 @@ import pyro_dynogp as dgp
 from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.data.channels import Recorded
 from pyro_dynogp.discrepancy import trials
+from pyro_dynogp.discrepancy.failures import TimeLimitError
 from pyro_dynogp.discrepancy.held_out import held_out_density
 from pyro_dynogp.effects.nonlinear_feedback import NonlinearFeedbackOfOutput
 from pyro_dynogp.inference import refit as refits
@@ -350,8 +351,30 @@ def test_variants_that_are_fitted_side_by_side_come_to_the_same(
     fold = np.arange(N) >= TRAINING
     trial = trials.Trial(tuple(models), record, (fold,), Made(plain, 0.0), 0, SETTINGS,
                          compared="held out")  # fmt: skip
-    assert trials.run(trial, workers).model == models[VARIANTS.index(kept)]
+    assert trials.run(trial, trials.Ahead(workers)).model == models[VARIANTS.index(kept)]
     assert max(groups) == min(workers, len(models))
+
+
+@pytest.mark.parametrize(("asked", "fitted"), [(1, 0), (3, 2)])
+def test_no_variant_is_begun_once_the_time_limit_has_passed(record, monkeypatch, asked, fitted):
+    """And a trial that the limit ends comes to nothing: what is left may have been better."""
+    plain = dgp.LinearDynamicGP(1, pairs=2)
+    said = SimpleNamespace(where={"output": "y", "products": 0.9})
+    models = NonlinearFeedbackOfOutput().extend(plain, said, record)
+    done = []
+
+    def again(fit, training, *, model, run):
+        done.append(model)
+        return Made(model, 0.0, records=(record,))
+
+    refitted_by(monkeypatch, again)
+    monkeypatch.setattr(trials, "are_noise", lambda errors, fit, most=0.0: False)
+    trial = trials.Trial(tuple(models), record, (np.arange(N) >= TRAINING,), Made(plain, 0.0), 0,
+                         SETTINGS, compared="held out")  # fmt: skip
+    answers = iter([False] * (asked - 1) + [True])
+    with pytest.raises(TimeLimitError):
+        trials.run(trial, trials.Ahead(late=answers.__next__))
+    assert len(done) == fitted
 
 
 @pytest.mark.parametrize("little", [(), ("fits",), ("base",), ("fits", "base")])

@@ -29,6 +29,9 @@ TABLES = {
     "two outputs of a table, two of the record": ([WIDE, LINE], {"n_y": 2, "pairs": 1}),
     "no function": ([], {"n_y": 2}),
     "one step": ([LINE], {"distinct": 1, "repeated": False}),
+    "a measured function": ([LINE], {"measured": True}),
+    "a measured function of another": ([WIDE, LINE], {"measured": True, "pairs": 3}),
+    "a measured function, heavy tails": ([LINE], {"measured": True, "student": True}),
 }
 RADIAL = {
     kernel: ([Block(kernel, 2, 2), LINE, Block(kernel, 3)], {"pairs": 1})
@@ -136,8 +139,9 @@ def test_a_variance_below_zero_is_no_density_and_no_warning():
     assert np.isfinite(density[0][there]).all()
 
 
-def test_a_point_without_a_density_leaves_the_others_alone():
-    problems = points("one table", 4)
+@pytest.mark.parametrize("case", ["one table", "a measured function"])
+def test_a_point_without_a_density_leaves_the_others_alone(case):
+    problems = points(case, 4)
     spoiled = [*problems]
     spoiled[1] = replace(problems[1], R=problems[1].R * torch.nan)
     clean, found = innovate_together(together(problems)), innovate_together(together(spoiled))
@@ -162,7 +166,9 @@ def test_a_point_that_breaks_has_no_density_beside_others(likelihood):
     assert torch.equal(broken[[0, 2]], whole[[0, 2]])
 
 
-@pytest.mark.parametrize("case", ["two outputs of a table, two of the record", *STUDENT])
+@pytest.mark.parametrize(
+    "case", ["two outputs of a table, two of the record", "a measured function", *STUDENT]
+)
 def test_densities_are_those_of_the_filter(case):
     """They add up to the density of one point."""
     problems = points(case, 4)
@@ -178,6 +184,4 @@ def test_what_goes_through_in_lanes():
     own = replace(together(problems), y=torch.stack([one.y for one in problems]))
     assert not lanes_serve(own)
     assert lanes_serve(together(points("heavy tails", FEWEST)))
-    kind = [random_problem([LINE], measured=True, seed=s) for s in range(FEWEST)]
-    kind = [replace(one, layout=kind[0].layout, y=kind[0].y) for one in kind]
-    assert not lanes_serve(together(kind))
+    assert lanes_serve(together(points("a measured function", FEWEST)))
