@@ -91,6 +91,8 @@ def confirm(
         if one not in sure and (not certain or one[0].effect.family in certain)
     ]  # fmt: skip
     judged += _judged(refits, further, judged)
+    if weighed:
+        judged = refits.by_evidence(judged, level)
     if not certain:
         first = confirmed_together(refits, judged, level)
         judged = [first if first and one.found is first.found else one for one in judged]

@@ -22,6 +22,7 @@ from pyro_dynogp.inference.bayes_factor import VERY_STRONG, log_evidence_of
 from pyro_dynogp.inference.refit import refit
 from pyro_dynogp.inference.run import Run
 from pyro_dynogp.models.delays import comparable
+from pyro_dynogp.models.feedback_variants import is_parametric
 from pyro_dynogp.models.variants import Model, without_process_noise
 from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.support.parallel import parallel_map
@@ -182,17 +183,20 @@ class Refits:
         whatever is right; the residual is certain (see `unsure`) and evidence is very strong.
         Parametric functions in feedback need gain nothing for certain, as long as they gain:
         they have few numbers, which short blocks tell too little of, and evidence is worth more.
+        Where no test is certain of anything (`weighed`) structure that nearly helps needs twice the
+        evidence: it stands alone.
         """
-        level = min(level, self.settings.unsure)
+        alone = self.weighed and all(one.kind[1] == "forecast" for one in judged)
+        level = 1.0 if alone else min(level, self.settings.unsure)
+        least = 2.0 * VERY_STRONG if alone else VERY_STRONG
         if any(one.helps for one in judged):
             return list(judged)
         return [
             self._weighed(one, True)
-            if self._may_be_weighed(one) and one.found.q_value <= level
-            and one.tried.fit is not None and self.evidence(one) > VERY_STRONG
+            if self._may_be_weighed(one, level) and self.evidence(one) > least
             else one
             for one in judged
-        ]  # fmt: skip
+        ]
 
     def _weighed(self, one: Judged, helps: bool) -> Judged:
         """A candidate that evidence has decided on."""
@@ -305,24 +309,22 @@ class Refits:
 
         return [again(one) if one in unsettled else one for one in judged]
 
-    def _may_be_weighed(self, one: Judged) -> bool:
-        """Whether a candidate nearly helps, or gains and adds parametric functions in feedback."""
-        if one.harms:
+    def _may_be_weighed(self, one: Judged, level: float) -> bool:
+        """Whether a candidate nearly helps, or gains and adds parametric functions in feedback.
+
+        The latter where tests are certain that something is missing.
+        """
+        if one.harms or one.tried.fit is None or one.found.q_value > level:
             return False
-        gains = one.attempt.gain > 0.0
+        gains = one.attempt.gain > 0.0 and not self.weighed
         return one.attempt.decision == "nearly" or (gains and self._adds_forms(one))
 
     def _adds_forms(self, one: Judged) -> bool:
         """Whether parametric functions in feedback are what a candidate adds."""
-        return _is_parametric(one.tried.model) and not _is_parametric(self.model)
+        return is_parametric(one.tried.model) and not is_parametric(self.model)
 
     def _may_lose(self, one: Judged) -> bool:
         """Whether a loss on the last block is neither certain nor one of a wrong shape."""
         attempt, effect = one.attempt, one.found.effect
         stiff = not one.tried.model.has_function and effect.acts_on == "inputs"
         return stiff and attempt.gain > -self.settings.standard_errors * attempt.gain_error
-
-
-def _is_parametric(model: Model) -> bool:
-    """Whether functions with parameters are in feedback, and none is a Gaussian process."""
-    return model.learns_function and not model.has_gaussian_process

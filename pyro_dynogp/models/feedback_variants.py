@@ -155,6 +155,11 @@ def has_other_dynamics(model: Model) -> bool:
     return any(layer.real or layer.mostly_hidden for _, layer in model.dynamic)
 
 
+def is_parametric(model: Model) -> bool:
+    """Whether functions with parameters are in feedback, and none is a Gaussian process."""
+    return model.learns_function and not model.has_gaussian_process
+
+
 def noise_allows_feedback(model: Model) -> bool:
     """Whether functions may be put in feedback beside the model's measurement noise."""
     return model.likelihood.gaussian and not model.likelihood.follows_output

@@ -281,6 +281,36 @@ def test_what_nearly_helps_is_settled_by_the_evidence_of_all_known_data(
 
 
 @pytest.mark.parametrize(
+    ("effect", "gain", "evidence", "helps"),
+    [
+        (INPUT, 17.0, 2.0 * VERY_STRONG + 0.1, True),
+        (INPUT, 17.0, 2.0 * VERY_STRONG - 0.1, False),
+        (INPUT, 14.0, 2.0 * VERY_STRONG + 0.1, False),  # not nearly
+        (effects.HeavyTails(), 17.0, 2.0 * VERY_STRONG + 0.1, False),  # no structure
+    ],
+)
+def test_where_no_test_is_certain_twice_the_evidence_is_asked_for(
+    monkeypatch: pytest.MonkeyPatch,
+    effect: effects.Effect,
+    gain: float,
+    evidence: float,
+    helps: bool,
+) -> None:
+    """Of structure, whatever its own test says: forecasts miss by far more than the noise."""
+    monkeypatch.setattr(Refits, "evidence", lambda self, one: evidence)
+    fit: Any = object()
+    one = candidate(effect, gain, 10.0, q=0.7)
+    one = replace(one, tried=replace(one.tried, fit=fit))
+    scored = refits(NOTHING)
+    assert scored.by_evidence([one], 0.05) == [one]
+    scored.weighed = True
+    assert scored.by_evidence([one], 0.05)[0].helps is helps
+    forms = replace(one, tried=replace(one.tried, model=dgp.Compartments(1)))
+    little = replace(forms, attempt=replace(forms.attempt, gain=0.1, decision="rejected"))
+    assert scored.by_evidence([little], 0.05) == [little]
+
+
+@pytest.mark.parametrize(
     ("model", "gain", "helps"),
     [
         (dgp.Compartments(1), 0.1, True),
@@ -332,7 +362,17 @@ def test_evidence_of_parametric_functions_is_that_of_free_runs(
     )
 
 
-def test_noise_that_nearly_helps_is_settled_so_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("weighed", "q", "expected"),
+    [
+        (False, 1e-8, [["dead time"], ["heavy tails"]]),
+        (False, 0.5, [[], ["heavy tails"]]),
+        (True, 0.5, [[], ["dead time"], ["heavy tails"]]),  # what no test is certain of as well
+    ],
+)
+def test_noise_that_nearly_helps_is_settled_so_as_well(
+    monkeypatch: pytest.MonkeyPatch, weighed: bool, q: float, expected: list[list[str]]
+) -> None:
     """Of the candidates of a round those of the noise come after the structure."""
     asked: list[list[str]] = []
 
@@ -348,9 +388,9 @@ def test_noise_that_nearly_helps_is_settled_so_as_well(monkeypatch: pytest.Monke
     current: Any = type("Current", (), {"model": MODEL})
     record: Any = range(480)
     tails = spoken_for(effects.HeavyTails(), 1e-9, 1e-8)
-    delay = spoken_for(DELAY, 1e-9, 1e-8)
+    delay = spoken_for(DELAY, 1e-9, q)
     confirm(
         [(delay, (MODEL,)), (tails, (MODEL,))], current, record, np.arange(480) >= 240,
-        number=1, seed=0, level=0.05, settings=SETTINGS, workers=1,
+        number=1, seed=0, level=0.05, settings=SETTINGS, workers=1, weighed=weighed,
     )  # fmt: skip
-    assert asked == [["dead time"], ["heavy tails"]]
+    assert asked == expected
