@@ -116,7 +116,7 @@ class LinearDensity:
             wire.name, layer, driving, model.direct, priors.places, shapes, time, prompt,
             model.reference_of(layer, scaling),
         )  # fmt: skip
-        self._priors = priors
+        self.priors = priors
         self._data = [_data(record, self._systems) for record in density.records]
         self._late = None
         if late:
@@ -128,8 +128,8 @@ class LinearDensity:
     @np.errstate(all="ignore")  # what is out of range ends as NaN, which is told apart
     def energies(self, u: np.ndarray, *, jacobian: bool) -> np.ndarray:
         """-log p (k,) at u (k, d), with `jacobian` of the vector; infinite where there is none."""
-        values = self._priors.values(u)
-        total = self._priors.log_prob(values.x)[0]
+        values = self.priors.values(u)
+        total = self.priors.log_prob(values.x)[0]
         systems, bad = self._systems(values.x), np.zeros(len(u), dtype=bool)
         for data in self._data:
             for part in self._parts(values.x, systems, data):
@@ -143,8 +143,8 @@ class LinearDensity:
     @np.errstate(all="ignore")
     def with_gradients(self, u: np.ndarray, *, jacobian: bool) -> tuple[np.ndarray, np.ndarray]:
         """`energies` (k,) and their gradients (k, d); zero where there is no density."""
-        values = self._priors.values(u)
-        total, by_x = self._priors.log_prob(values.x)
+        values = self.priors.values(u)
+        total, by_x = self.priors.log_prob(values.x)
         systems, bad = self._systems(values.x), np.zeros(len(u), dtype=bool)
         for data in self._data:
             for part in self._parts(values.x, systems, data):
@@ -162,22 +162,12 @@ class LinearDensity:
         return np.where(bad, np.inf, -total), np.where(bad[:, None], 0.0, -slope)
 
     @np.errstate(all="ignore")
-    def prior_energies(self, u: np.ndarray, *, jacobian: bool) -> tuple[np.ndarray, np.ndarray]:
-        """-log prior (k,) at u (k, d), with `jacobian` of the vector; its gradients (k, d)."""
-        values = self._priors.values(u)
-        total, by_x = self._priors.log_prob(values.x)
-        slope = by_x * values.slope
-        if jacobian:
-            total, slope = total + values.log_jacobian, slope + values.log_jacobian_slope
-        return -total, -slope
-
-    @np.errstate(all="ignore")
     def innovations(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Innovations and variances (k, N) of the measured samples, in units of the record.
 
         NaN where there is no density.
         """
-        x = self._priors.values(u).x
+        x = self.priors.values(u).x
         systems = self._systems(x)
         errors, variances = [], []
         for data in self._data:

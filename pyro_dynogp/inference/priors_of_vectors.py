@@ -224,6 +224,16 @@ class VectorPriors:
                 by_x[:, one] -= (power / size)[:, None] * here
         return total, by_x
 
+    @np.errstate(all="ignore")
+    def energies(self, u: np.ndarray, *, jacobian: bool) -> tuple[np.ndarray, np.ndarray]:
+        """-log prior (k,) at u (k, d), with `jacobian` of the vector; its gradients (k, d)."""
+        values = self.values(u)
+        total, by_x = self.log_prob(values.x)
+        slope = by_x * values.slope
+        if jacobian:
+            total, slope = total + values.log_jacobian, slope + values.log_jacobian_slope
+        return -total, -slope
+
 
 def vector_priors(sites: Sequence[Site]) -> VectorPriors | None:
     """Priors of all sites; None where there is none, or one of another kind."""

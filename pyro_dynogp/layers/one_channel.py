@@ -142,6 +142,18 @@ def _padded(x: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(np.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, more)]))
 
 
+def _once_each(form: str, arrays: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """What `evaluate` has of each element; of equal ones, as differences by poles ask for, once."""
+    done: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+    found = []
+    for one in zip(*arrays, strict=True):
+        key = b"".join(part.tobytes() for part in one)
+        if key not in done:
+            done[key] = evaluate(FORMS[form], *one)
+        found.append(done[key])
+    return found
+
+
 class _Moments(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, form: str, *args: Tensor) -> Any:  # x z inverse alpha L
@@ -150,7 +162,7 @@ class _Moments(torch.autograd.Function):
         arrays[0] = _padded(arrays[0])
         ctx.form, ctx.arrays = form, arrays
         ctx.save_for_backward(*args)
-        found = [evaluate(FORMS[form], *one) for one in zip(*arrays, strict=True)]
+        found = _once_each(form, arrays)
         mean = np.stack([m for m, _ in found])[..., :n]
         return torch.from_numpy(mean), torch.from_numpy(np.stack([q for _, q in found])[..., :n])
 

@@ -146,7 +146,7 @@ def test_the_prior_alone():
     x = z.clone().requires_grad_()
     energy = -potential.log_density.prior.log_prob(potential.unpack(x))
     (gradient,) = torch.autograd.grad(energy.sum(), x)
-    value, slope = lean.prior_energies(z.numpy(), jacobian=False)
+    value, slope = lean.priors.energies(z.numpy(), jacobian=False)
     np.testing.assert_allclose(value, energy.detach().numpy(), rtol=1e-12)
     np.testing.assert_allclose(slope, gradient.numpy(), rtol=1e-9, atol=1e-12)
 

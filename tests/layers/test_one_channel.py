@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from pyro_dynogp.layers import one_channel
 from pyro_dynogp.layers.one_channel import FORMS, moments_along, plain
 
 COUNT, LOCATIONS = 21, 6
@@ -72,3 +73,22 @@ def test_derivatives_can_be_differentiated(form):
     args = arguments(())
     args[1].data[3] += 0.1
     assert torch.autograd.gradgradcheck(lambda *parts: moments_along(form, *parts), args)
+
+
+def test_equal_elements_are_evaluated_once(monkeypatch):
+    """As where differences are taken by what is no number of the function."""
+    calls = []
+    evaluate = one_channel.evaluate
+
+    def counted(*given):
+        calls.append(given)
+        return evaluate(*given)
+
+    args = [part.detach() for part in arguments((3,))]
+    places = [0, 1, 0, 2, 1]
+    alone = moments_along("rbf", *args)
+    monkeypatch.setattr(one_channel, "evaluate", counted)
+    found = moments_along("rbf", *(part[places] for part in args))
+    assert len(calls) == 3
+    for ours, each in zip(found, alone, strict=True):
+        assert torch.equal(ours, each[places])

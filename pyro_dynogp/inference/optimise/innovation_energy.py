@@ -128,6 +128,7 @@ class Innovations:
         self.jacobian = jacobian
         # Lengths are for climbs of the values' density alone.
         self._linear, self._lengths = potential.linear, Lengths([] if jacobian else potential.sites)
+        self._priors = potential.priors if potential.linear is None else potential.linear.priors
         self._of_mean, self._of_variance = information(self.density.model.likelihood)
         self._there = [~torch.isnan(y) for y in self.density.observations]
         model = self.density.model
@@ -221,9 +222,9 @@ class Innovations:
     def _prior(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Energies (k,) of the prior at z (k, d), and their gradients (k, d)."""
         more, further = self._lengths.energies(z)
-        if self._linear is not None:
-            energy, gradient = self._linear.prior_energies(z, jacobian=self.jacobian)
-            return energy + more, gradient + further
+        if self._priors is not None:
+            energy, gradient = self._priors.energies(z, jacobian=self.jacobian)
+            return energy + more - float(self.density.constant), gradient + further
         x = torch.tensor(z, requires_grad=True)
         with torch.enable_grad(), pyro.validation_enabled(False):
             prior = self.density.prior.log_prob(self.potential.unpack(x)) + self.density.constant
@@ -242,12 +243,19 @@ class Innovations:
                     np.split(z, range(self.width, len(z), self.width))]  # fmt: skip
         return Innovated(*(np.concatenate(part) for part in zip(*portions, strict=True)))
 
+    def _values(self, z: Tensor) -> dict[str, Tensor]:
+        """Constrained values of every site at z (k, d)."""
+        if self._priors is None:
+            return self.potential.unpack(z)
+        with np.errstate(all="ignore"):  # as torch, which says nothing where numbers are too large
+            return self._priors.by_site(torch.from_numpy(self._priors.values(z.numpy()).x))
+
     def _portion(self, z: Tensor) -> Innovated:
         """`_innovations` of few points; where one breaks the evaluation of all, NaN for it."""
         try:
             with torch.no_grad(), pyro.validation_enabled(False):
                 found = []
-                outputs = self.density.outputs(self.potential.unpack(z))
+                outputs = self.density.outputs(self._values(z))
                 each = zip(outputs, self.density.observations, self._there, strict=True)
                 for process, y, there in each:
                     found.append([part[:, there].numpy() for part in process.innovations(y)])
