@@ -116,9 +116,8 @@ class _Rated(NamedTuple):
 class Ahead(NamedTuple):
     """How variants are fitted that are compared ahead; results are the same.
 
-    Attributes:
-        workers: processes. progress: label of a bar, "" for none.
-        late: says whether the time limit has passed, asked before each of them; None for none.
+    workers: processes. progress: label of a bar, "" for none. late: says whether the time limit has
+    passed, asked before each of them; None for none.
     """
 
     workers: int = 1
@@ -126,7 +125,10 @@ class Ahead(NamedTuple):
     late: Callable[[], bool] | None = None
 
 
-def run(trial: Trial, ahead: Ahead = Ahead()) -> Tried:  # noqa: B008 - it does not change
+ALONE = Ahead()
+
+
+def run(trial: Trial, ahead: Ahead = ALONE) -> Tried:
     """Refit the variants on the first fold's training data, the best on all; score the folds.
 
     Raises:
