@@ -11,6 +11,7 @@ from pyro_dynogp.data.record import Record
 from pyro_dynogp.discrepancy.stretches import stretches
 from pyro_dynogp.effects.base import Score
 from pyro_dynogp.fitting import Fit
+from pyro_dynogp.inference.bayes_factor import VERY_STRONG, log_bayes_factor
 from pyro_dynogp.models.outputs import output_process
 from pyro_dynogp.prediction.first_state import beginning
 from pyro_dynogp.prediction.predict import forecast
@@ -106,3 +107,17 @@ def are_noise(errors: np.ndarray, fit: Fit, most: float = NOISE_ALONE) -> bool:
         return False
     rmse = np.sqrt(np.nanmean(np.square(errors), axis=0))
     return bool((rmse <= most * fit.noise_sd).all())
+
+
+def is_more_probable(one: Fit, best: Fit, gain: np.ndarray, settings: LoopSettings) -> bool:
+    """Whether there is very strong evidence for a variant in the data of both, learnt and held out.
+
+    The density of the data held out adds to the evidence of those learnt from. Neither may speak
+    against it: these with very strong evidence, those with certainty. A block is short.
+
+    Args:
+        gain: of its log-density on held-out data [nats].
+    """
+    factor = log_bayes_factor(one, best)
+    against = factor < -VERY_STRONG or certain(-gain, settings)
+    return factor + float(gain.sum()) > VERY_STRONG and not against

@@ -18,16 +18,18 @@ from pyro_dynogp.discrepancy.held_out import (
     are_noise,
     certain,
     held_out_density,
+    is_more_probable,
     scored,
     without,
 )
+from pyro_dynogp.discrepancy.leading_variant import leading
 from pyro_dynogp.discrepancy.rehearsal import lasting
 from pyro_dynogp.effects.base import Compared, Score
 from pyro_dynogp.fitting import Fit
-from pyro_dynogp.inference.bayes_factor import VERY_STRONG, energy, log_bayes_factor
+from pyro_dynogp.inference.bayes_factor import energy
 from pyro_dynogp.inference.refit import race, refit, refits
 from pyro_dynogp.inference.run import Run
-from pyro_dynogp.models.delays import comparable, longest_delay
+from pyro_dynogp.models.delays import longest_delay
 from pyro_dynogp.models.feedback_variants import (
     acting_back,
     has_other_dynamics,
@@ -170,12 +172,8 @@ def _kept(trial: Trial, training: Record, ahead: Ahead) -> Fit:
     (model, *others), start = trial.models, trial.base
     finer = _finer(trial, model, training, 0)
     if others or finer:
-        same = comparable(training, [*trial.models, *finer], trial.settings.reach)
-        found, problems = race(trial.base, trial.models, same, trial.run)
-        if not found:
-            raise problems[0]
-        start = found[0]
-        longest = trial.settings.reach * longest_delay(*trial.models, *finer)
+        reach = trial.settings.reach
+        start, same, longest = leading(trial.base, trial.models, finer, training, reach, trial.run)
         for times in range(trial.settings.refinements):
             start = _refined(trial, start, training, same, times, longest)
         model = start.model
@@ -266,7 +264,7 @@ def _best_ahead(trial: Trial, training: Record, ahead: Ahead) -> Fit:
     best, highest, _ = found[0]
     for one, own, _ in found[1:]:
         gain = own - highest
-        if certain(gain, settings) or (shape and _is_more_probable(one, best, gain, settings)):
+        if certain(gain, settings) or (shape and is_more_probable(one, best, gain, settings)):
             best, highest = one, own
     return best
 
@@ -294,20 +292,6 @@ def _wanted(trial: Trial, place: int, found: Sequence[_Rated]) -> bool:
         return True
     least = held_out_density(trial.base, trial.record, trial.folds[0], trial.score)
     return bool(most.sum() > least.sum()) and acting_back(leading.model) in joined
-
-
-def _is_more_probable(one: Fit, best: Fit, gain: np.ndarray, settings: LoopSettings) -> bool:
-    """Whether there is very strong evidence for a variant in the data of both, learnt and held out.
-
-    The density of the data held out adds to the evidence of those learnt from. Neither may speak
-    against it: these with very strong evidence, those with certainty. A block is short.
-
-    Args:
-        gain: of its log-density on held-out data [nats].
-    """
-    factor = log_bayes_factor(one, best)
-    against = factor < -VERY_STRONG or certain(-gain, settings)
-    return factor + float(gain.sum()) > VERY_STRONG and not against
 
 
 def with_substeps(trial: Trial, tried: Tried) -> Tried:

@@ -11,7 +11,7 @@ import torch
 import pyro_dynogp as dgp
 from pyro_dynogp import effects
 from pyro_dynogp.data.channels import Delayed, Play, Recorded, Step, Trend
-from pyro_dynogp.discrepancy import trials
+from pyro_dynogp.discrepancy import leading_variant, trials
 from pyro_dynogp.discrepancy.failures import why_not
 from pyro_dynogp.discrepancy.held_out import forecast_errors, held_out_density
 from pyro_dynogp.discrepancy.search import candidates_of
@@ -304,19 +304,22 @@ def test_no_variant_is_later_than_all_are_compared_for(monkeypatch, record, base
         asked.append((longest_delay(*models), int(np.isnan(same.outputs[:, 0]).sum())))
         return race(fit, models, same, run)
 
-    monkeypatch.setattr(trials, "race", noted)
+    for module in (trials, leading_variant):
+        monkeypatch.setattr(module, "race", noted)
     fold = np.arange(len(record)) >= 200
     # Each time something later is near, and looks better than it is.
-    steps = iter([later(4.0), later(5.0), later(6.0), later(9.0), later(12.0)])
+    steps = iter([later(4.0), later(3.5), later(3.7), later(9.0), later(12.0)])
     trial = Trial(
         (later(2.0), later(3.0)), record, (fold,), base, 0, SETTINGS, "forecast",
         refine=lambda model, data, times: [next(steps, later(20.0))],
     )  # fmt: skip
     run(trial)
-    assert len(asked) > 1
-    longest = SETTINGS.reach * 4.0 * STEP
-    assert all(delay <= longest + 1e-12 for delay, _ in asked)
-    assert {missing for _, missing in asked} == {unknown_beginning(record, longest)}
+    (_, missing), *further = asked
+    assert missing == unknown_beginning(record, SETTINGS.reach * 4.0 * STEP)  # of what is to come
+    assert len(further) > 1
+    longest = SETTINGS.reach * 3.0 * STEP  # of the variants that lead
+    assert all(delay <= longest + 1e-12 for delay, _ in further)
+    assert {missing for _, missing in further} == {unknown_beginning(record, longest)}
 
 
 def test_functions_are_fitted_from_the_base_once_a_variant_is_chosen(monkeypatch, record):
@@ -342,7 +345,8 @@ def test_what_has_no_finer_variants_races_once(monkeypatch, record, base):
         asked.append(len(models))
         return race(fit, models, same, run)
 
-    monkeypatch.setattr(trials, "race", noted)
+    for module in (trials, leading_variant):
+        monkeypatch.setattr(module, "race", noted)
     fold = np.arange(len(record)) >= 200
     run(Trial((later(4.0), later(5.0)), record, (fold,), base, 0, SETTINGS, "forecast"))
     assert asked == [2]

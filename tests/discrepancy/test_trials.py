@@ -11,7 +11,7 @@ import torch
 import pyro_dynogp as dgp
 from pyro_dynogp.criticism.comparison import block_standard_error
 from pyro_dynogp.data.channels import Recorded
-from pyro_dynogp.discrepancy import trials
+from pyro_dynogp.discrepancy import held_out, trials
 from pyro_dynogp.discrepancy.failures import TimeLimitError
 from pyro_dynogp.discrepancy.held_out import held_out_density
 from pyro_dynogp.effects.nonlinear_feedback import NonlinearFeedbackOfOutput
@@ -188,9 +188,10 @@ def refitted_by(monkeypatch, again, noise=False):
     monkeypatch.setattr(trials, "held_out_density", density)
     monkeypatch.setattr(trials, "scored", lambda fit, *_: (density(fit), np.zeros((9, 1))))
     monkeypatch.setattr(trials, "are_noise", lambda errors, fit, most=0.0: noise)
-    monkeypatch.setattr(trials, "certain", lambda gain, settings: gain.sum() > 1.0)
+    for module in (trials, held_out):
+        monkeypatch.setattr(module, "certain", lambda gain, settings: gain.sum() > 1.0)
     monkeypatch.setattr(
-        trials, "log_bayes_factor", lambda one, other: one.evidence - other.evidence
+        held_out, "log_bayes_factor", lambda one, other: one.evidence - other.evidence
     )
 
 
@@ -479,9 +480,9 @@ def test_of_functions_that_forecast_alike_the_more_probable_one_is_kept(
     [(-4.9, 10.0, True), (-4.9, 9.8, False), (-5.1, 90.0, False), (np.nan, 90.0, False)],
 )
 def test_held_out_data_do_not_outweigh_very_strong_evidence(monkeypatch, factor, gain, more):
-    monkeypatch.setattr(trials, "log_bayes_factor", lambda one, best: factor)
-    monkeypatch.setattr(trials, "certain", lambda gain, settings: False)
-    assert trials._is_more_probable(None, None, np.array([gain]), SETTINGS) is more
+    monkeypatch.setattr(held_out, "log_bayes_factor", lambda one, best: factor)
+    monkeypatch.setattr(held_out, "certain", lambda gain, settings: False)
+    assert held_out.is_more_probable(None, None, np.array([gain]), SETTINGS) is more
 
 
 def test_substeps_that_cannot_be_fitted_are_left(record, monkeypatch):
