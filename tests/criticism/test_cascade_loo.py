@@ -26,7 +26,10 @@ def left_out(fit):
     return dgp.loo(fit, target="missing sample", refits=4, **QUIET)
 
 
-def test_single_samples_against_a_sampler_that_never_saw_them(fit, left_out):
+def test_single_samples_against_a_sampler_that_never_saw_them():
+    """Of 60 samples: with 36 errors are 0.2 to 0.9 nats, by the seed."""
+    fit = dgp.fit(wiener(process_noise=False), wiener_record(60), restarts=2, **QUIET)
+    left_out = dgp.loo(fit, target="missing sample", refits=4, **QUIET)
     real, own_error = exact(fit, CHOSEN, times=6)
     ours = left_out.loo_i.values[CHOSEN]
     subject = FitSubject(fit, fit.records, 0, 0)
@@ -34,9 +37,9 @@ def test_single_samples_against_a_sampler_that_never_saw_them(fit, left_out):
     ratio = -density.T
     log_weights = ratio - np.logaddexp.reduce(ratio, axis=1, keepdims=True)
     error = monte_carlo_error(log_weights, density, ours, subject.draws.ancestor)
-    assert np.hypot(error, own_error) < 0.25
-    # More than the errors say: chains of so short a record have not forgotten where they began.
-    assert np.abs(ours - real).max() < 0.75
+    both = np.hypot(error, own_error)
+    assert both < 0.25
+    assert np.abs(ours - real).max() < 3.0 * both
 
 
 def test_a_posterior_of_functions_alone_flatters(fit, left_out):
