@@ -43,9 +43,15 @@ def leading(
     found, problems = race(base, models, same, run)
     if not found:
         raise problems[0]
-    nearest = [replace(one.model, scaling=None) for one in found[:NEAREST]]
+    nearest = [unscaled(one) for one in found[:NEAREST]]
     shorter = longest_delay(*nearest)
     if 0.0 < shorter < longest:
         longest, same = shorter, where_inputs_are_known(training, reach * shorter)
         found, _ = race(base, nearest, same, run)
     return found[0], same, reach * longest
+
+
+def unscaled(fit: Fit) -> Model:
+    """Its model, which gets the units of the next record."""
+    model: Model = replace(fit.model, scaling=None)
+    return model

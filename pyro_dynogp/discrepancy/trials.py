@@ -22,7 +22,7 @@ from pyro_dynogp.discrepancy.held_out import (
     scored,
     without,
 )
-from pyro_dynogp.discrepancy.leading_variant import leading
+from pyro_dynogp.discrepancy.leading_variant import leading, unscaled
 from pyro_dynogp.discrepancy.rehearsal import lasting
 from pyro_dynogp.effects.base import Compared, Score
 from pyro_dynogp.fitting import Fit
@@ -154,7 +154,7 @@ def run(trial: Trial, ahead: Ahead = ALONE) -> Tried:
         failure = why_not(trial.models, trial.record, trial.folds, error)
         parts = [np.zeros(0)]
     return Tried(
-        trial.models[0] if first is None else _unscaled(first),
+        trial.models[0] if first is None else unscaled(first),
         np.concatenate(parts),
         time.perf_counter() - begin,
         failure,
@@ -178,7 +178,7 @@ def _kept(trial: Trial, training: Record, ahead: Ahead) -> Fit:
             start = _refined(trial, start, training, same, times, longest)
         model = start.model
         if model.has_function:  # few steps may have led to a poor optimum
-            start, model = trial.base, _unscaled(start)
+            start, model = trial.base, unscaled(start)
     return refit(start, training, model=model, run=trial.run)
 
 
@@ -199,14 +199,14 @@ def _refined(
         longest: delay that variants may have there.
     """
     for _ in range(MOVES):
-        here = _unscaled(start)
+        here = unscaled(start)
         close = _finer(trial, here, training, times)
         known = [one for one in close if longest_delay(one) <= longest]
         if not known:
             break
         # The variant itself takes part: all climb further in a race.
         ranked, _ = race(start, [here, *known], same, trial.run)
-        own = next(one for one in ranked if _unscaled(one) == here)
+        own = next(one for one in ranked if unscaled(one) == here)
         start = ranked[0]
         if energy(own) - energy(start) <= trial.settings.gain:
             break
@@ -307,8 +307,3 @@ def with_substeps(trial: Trial, tried: Tried) -> Tried:
     if found.failure or not certain(found.densities - tried.densities, trial.settings):
         return tried
     return found
-
-
-def _unscaled(fit: Fit) -> Model:
-    model: Model = replace(fit.model, scaling=None)
-    return model

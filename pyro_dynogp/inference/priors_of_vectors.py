@@ -56,10 +56,7 @@ class Constrained(torch.autograd.Function):
         """Values and densities; derivatives are made at once."""
         with np.errstate(all="ignore"):  # what is out of range ends as NaN, which is told apart
             values = priors.values(z.detach().numpy())
-            total, by_x = priors.log_prob(values.x)
-            by_u = by_x * values.slope
-            if jacobian:
-                total, by_u = total + values.log_jacobian, by_u + values.log_jacobian_slope
+            total, by_u = priors.density(values, jacobian=jacobian)
         ctx.slopes = torch.from_numpy(values.slope), torch.from_numpy(by_u)
         return torch.from_numpy(values.x), torch.from_numpy(total)
 
@@ -224,14 +221,18 @@ class VectorPriors:
                 by_x[:, one] -= (power / size)[:, None] * here
         return total, by_x
 
-    @np.errstate(all="ignore")
-    def energies(self, u: np.ndarray, *, jacobian: bool) -> tuple[np.ndarray, np.ndarray]:
-        """-log prior (k,) at u (k, d), with `jacobian` of the vector; its gradients (k, d)."""
-        values = self.values(u)
+    def density(self, values: Values, *, jacobian: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Log prior (k,), with `jacobian` that of the vector, and its derivatives by it (k, d)."""
         total, by_x = self.log_prob(values.x)
         slope = by_x * values.slope
         if jacobian:
             total, slope = total + values.log_jacobian, slope + values.log_jacobian_slope
+        return total, slope
+
+    @np.errstate(all="ignore")
+    def energies(self, u: np.ndarray, *, jacobian: bool) -> tuple[np.ndarray, np.ndarray]:
+        """-log prior (k,) at u (k, d), with `jacobian` of the vector; its gradients (k, d)."""
+        total, slope = self.density(self.values(u), jacobian=jacobian)
         return -total, -slope
 
 

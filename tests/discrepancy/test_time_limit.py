@@ -187,6 +187,7 @@ def test_a_trial_that_the_limit_ends_has_no_result(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(refits, "run", ended)
     tasks: dict[str, Any] = {name: SimpleNamespace(name=name, is_long=True) for name in "abc"}
     one = SimpleNamespace(number=1, workers=1, progress=False, late=lambda: False, early=False)
+    # A stand-in has all that the method asks for, and is no `Refits`.
     assert refits.Refits.run(one, tasks, "refits") == {"a": "a"}  # type: ignore[arg-type]
     assert asked == ["a", "b"]
     assert one.early

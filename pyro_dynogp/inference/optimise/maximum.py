@@ -220,7 +220,7 @@ def maximise(
     held: Sequence[str] = (),
     learnt: int = 0,
 ) -> list[Optimum]:
-    """Climbed from every start; the optima sorted by energy, best first.
+    """Climb from every start; the optima sorted by energy, best first.
 
     All starts get a fifth of the steps, then the best of them the rest (successive halving: a start
     that is far behind by then hardly ever wins); by Gauss-Newton in the stages of `RANKED`. The
