@@ -87,10 +87,7 @@ class Refits:
         return replace(plain, refine=found.effect.refine, compared=found.effect.compared)
 
     def run(self, tasks: dict[Any, Trial], label: str) -> dict[Any, Tried]:
-        """Results of trials by key; with a time limit of those that are begun before it passes.
-
-        Then as many at a time as there are workers, with a look at the clock between.
-        """
+        """Results by key; with a time limit of as many trials at a time as workers, until then."""
         workers = self.workers or joblib.cpu_count()
         bar = f"{label}, round {self.number}"
         long = [key for key, trial in tasks.items() if trial.is_long]
@@ -310,17 +307,19 @@ class Refits:
         return [again(one) if one in unsettled else one for one in judged]
 
     def _may_be_weighed(self, one: Judged, level: float) -> bool:
-        """Whether a candidate nearly helps, or gains and adds parametric functions in feedback.
+        """Whether a candidate nearly helps, or gains where no more can be expected.
 
-        The latter where tests are certain that something is missing.
+        The latter where tests are certain: of parametric functions in feedback, and of a response
+        that may lie in a single block, which is held out.
         """
         if one.harms or one.tried.fit is None or one.found.q_value > level:
             return False
-        gains = one.attempt.gain > 0.0 and not self.weighed
-        return one.attempt.decision == "nearly" or (gains and self._adds_forms(one))
+        brief = self._adds_forms(one) or one.found.effect.compared == "known"
+        gains = brief and not self.weighed and one.attempt.gain > 0.0
+        return one.attempt.decision == "nearly" or gains
 
     def _adds_forms(self, one: Judged) -> bool:
-        """Whether parametric functions in feedback are what a candidate adds."""
+        """Whether it adds parametric functions in feedback."""
         return is_parametric(one.tried.model) and not is_parametric(self.model)
 
     def _may_lose(self, one: Judged) -> bool:

@@ -79,7 +79,7 @@ class Trial:
     @property
     def is_long(self) -> bool:
         """Whether its variants are compared ahead, and so fitted one by one."""
-        return len(self.models) > 1 and self.compared != "training"
+        return len(self.models) > 1 and self.compared in ("held out", "rehearsed")
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,12 +170,13 @@ def _kept(trial: Trial, training: Record, ahead: Ahead) -> Fit:
     if trial.is_long:
         return _best_ahead(trial, training, ahead)
     (model, *others), start = trial.models, trial.base
-    finer = _finer(trial, model, training, 0)
+    seen = trial.record if trial.compared == "known" else training
+    finer = _finer(trial, model, seen, 0)
     if others or finer:
         reach = trial.settings.reach
-        start, same, longest = leading(trial.base, trial.models, finer, training, reach, trial.run)
+        start, same, longest = leading(trial.base, trial.models, finer, seen, reach, trial.run)
         for times in range(trial.settings.refinements):
-            start = _refined(trial, start, training, same, times, longest)
+            start = _refined(trial, start, seen, same, times, longest)
         model = start.model
         if model.has_function:  # few steps may have led to a poor optimum
             start, model = trial.base, unscaled(start)

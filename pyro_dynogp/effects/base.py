@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 # Densities on which an effect must pay.
 Score = Literal["one step", "forecast"]
 # Data on which variants of an effect are compared.
-Compared = Literal["training", "held out", "rehearsed"]
+Compared = Literal["training", "known", "held out", "rehearsed"]
 ActsOn = Literal["inputs", "time", "noise"]
 # Posterior mean and standard deviation of numbers by label, unit included.
 Parameters = dict[str, tuple[float, float]]
@@ -53,9 +53,10 @@ class Effect:
         added: whether a block mends it; False for what is only reported.
         localised: whether it happens at one instant, so that refits are scored on blocks of the
             whole record rather than after it.
-        compared: on which data its variants are: those that are fitted to; those held out, where
-            the first is kept, or a later one that is certainly better; or "rehearsed", for variants
-            that differ in how they extrapolate: held out, of those whose forecasts last.
+        compared: on which data its variants are: those that are fitted to; all that are "known",
+            where they differ at an instant that may be held out; those held out, where the first is
+            kept, or a later one that is certainly better; or "rehearsed", for variants that differ
+            in how they extrapolate: held out, of those whose forecasts last.
         absorbs_structure: whether its block takes up whatever else a model lacks, so that a search
             begins without it.
         experiments: by name of another effect, the experiment that tells the two apart. One of

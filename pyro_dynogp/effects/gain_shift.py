@@ -16,11 +16,9 @@ from pyro_dynogp.statistics.pictures import about, evidence, instant, over_time
 from pyro_dynogp.statistics.prewhitening import Projection, spanning
 from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.statistics.shares_of_inputs import contributions, paths
-from pyro_dynogp.statistics.steps import instants, step_scan
+from pyro_dynogp.statistics.steps import beginning, instants, step_scan
 from pyro_dynogp.support.errors import invalid
 
-# Of instants that are tried around one, by how much they are closer each time.
-NARROWER = 30
 # Signals that are filtered at once.
 AT_ONCE = 8
 # How long a gain may take to change, as shares of the record.
@@ -83,7 +81,7 @@ def _nearby(
 
     A product with the mean begins at once where the response to the input begins slowly: by about
     a time constant the instant is wrong. The level may step as well, for whatever input does
-    nothing. Some instants are tried, and then those around the best of them, down to every one.
+    nothing.
 
     Args:
         of: inputs whose gain steps. under: the filter, and what the step may not claim.
@@ -95,7 +93,7 @@ def _nearby(
     r, path = residuals, paths(residuals)
     signals = [(j, r.inputs[:, j] - r.inputs[:, j].mean()) for j in of]
     levels = [(j, np.full(len(r), x.std())) for j, x in signals]
-    e, row = under(r.residual), np.arange(len(r))
+    row = np.arange(len(r))
 
     def responses(signals: Sequence[tuple[int, np.ndarray]], places: np.ndarray) -> np.ndarray:
         """Of signals that begin at each place, through the paths of their inputs, (n, M)."""
@@ -106,19 +104,11 @@ def _nearby(
             for j, x in signals
         ], axis=0)  # fmt: skip
 
-    stride = within
-    while True:
-        stride = max(stride // NARROWER, 1)
-        around = np.arange(at - within, at + within + 1, stride)
-        around = around[(around >= places[0]) & (around <= places[-1])]
-        columns = np.stack([responses(signals, around), responses(levels, around)], axis=2)
-        pairs = np.stack([under(columns[..., k]) for k in (0, 1)], axis=2).swapaxes(0, 1)
-        weights = np.linalg.pinv(pairs, rcond=1e-6) @ e
-        left = np.square(e - np.einsum("jmk,jk->jm", pairs, weights)).sum(1)
-        best = int(np.argmin(left))
-        at, within = int(around[best]), stride
-        if stride == 1:
-            return at, float(weights[best, 0]), columns[:, best] @ weights[best]
+    def columns(places: np.ndarray) -> np.ndarray:
+        return np.stack([responses(signals, places), responses(levels, places)], axis=2)
+
+    at, weights, fitted = beginning(r.residual, columns, under, places, at, within)
+    return at, float(weights[0]), fitted
 
 
 class GainShift(Effect):

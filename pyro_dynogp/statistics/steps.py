@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from pyro_dynogp.statistics.bootstrap import Scan
@@ -18,6 +20,8 @@ from pyro_dynogp.statistics.settings import LoopSettings
 
 # Levels of a staircase that stands for any step while the first filter is fitted.
 LEVELS = 8
+# Of instants that are tried around one, by how much they are closer each time.
+NARROWER = 30
 
 
 def step_scan(
@@ -51,6 +55,42 @@ def step_scan(
     )
     k, place = divmod(scan.best, len(places))
     return scan, k, int(places[place])
+
+
+def beginning(
+    residual: np.ndarray,
+    columns: Callable[[np.ndarray], np.ndarray],
+    under: Projection,
+    places: np.ndarray,
+    at: int,
+    within: int,
+) -> tuple[int, np.ndarray, np.ndarray]:
+    """The sample near one at which signals begin that explain most of a residual.
+
+    Some instants are tried, and then those around the best of them, down to every one.
+
+    Args:
+        residual: (n,). columns: samples (m,) -> (n, m, K), the signals that begin at each of them.
+        under: the filter, and what the signals may not claim. places: samples where it may be.
+        at: where to begin, one of `places`. within: how far from there it may be [samples].
+
+    Returns:
+        The sample, weights of its signals (K,), and what they explain (n,).
+    """
+    e, stride = under(residual), within
+    while True:
+        stride = max(stride // NARROWER, 1)
+        around = np.arange(at - within, at + within + 1, stride)
+        around = around[(around >= places[0]) & (around <= places[-1])]
+        made = columns(around)
+        filtered = np.stack([under(column) for column in np.moveaxis(made, 2, 0)], axis=2)
+        filtered = filtered.swapaxes(0, 1)
+        weights = np.linalg.pinv(filtered, rcond=1e-6) @ e
+        left = np.square(e - np.einsum("jmk,jk->jm", filtered, weights)).sum(1)
+        best = int(np.argmin(left))
+        at, within = int(around[best]), stride
+        if stride == 1:
+            return at, weights[best], made[:, best] @ weights[best]
 
 
 def instants(count: int, margin: float) -> np.ndarray:

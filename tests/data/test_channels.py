@@ -38,6 +38,7 @@ ALL = [
     channels.Transformed("ambient", "square", 0.1),
     channels.Product("ambient", "load", 0.1, 0.2),
     channels.Step(12.0),
+    channels.StepInput(12.0),
     channels.Trend(0.0, 10.0),
     channels.TrendOfGain("load", 0.0, 0.0, 10.0),
     channels.Sinusoid(4.0, 2),
@@ -181,3 +182,11 @@ def test_a_shifted_clock_reads_the_input_elsewhere_between_its_instants() -> Non
     inside = (own.time >= 10.0) & (own.time < 20.0)
     np.testing.assert_allclose(made[~inside], own.inputs[~inside, 1])
     np.testing.assert_allclose(made[inside], own.inputs[np.flatnonzero(inside) + 2, 1], atol=1e-12)
+
+
+def test_a_step_acts_at_once_or_through_the_dynamics() -> None:
+    """The same column; the one that acts through dynamics comes among the inputs, before others."""
+    made = channels.prepared(record(), [channels.Step(9.0), channels.StepInput(12.0)])
+    assert made.input_names[-2:] == ("disturbance from 12", "step at 9")
+    assert (made.inputs[:, -2] == (made.time >= 12.0)).all()
+    assert channels.count_direct([channels.Step(9.0), channels.StepInput(12.0)]) == 1

@@ -337,6 +337,28 @@ def test_parametric_functions_in_feedback_are_settled_by_evidence_where_they_gai
 
 
 @pytest.mark.parametrize(
+    ("effect", "gain", "q", "helps"),
+    [
+        (effects.LevelShift(), 0.1, 1e-4, True),
+        (effects.LevelShift(), -0.1, 1e-4, False),  # held-out data speak against it
+        (effects.LevelShift(), 0.1, 0.0101, False),  # the residual has its doubts
+        (effects.GainShift(), 0.1, 1e-4, False),
+    ],
+)
+def test_what_one_block_may_hide_is_settled_by_evidence_where_it_gains(
+    monkeypatch: pytest.MonkeyPatch, effect: effects.Effect, gain: float, q: float, helps: bool
+) -> None:
+    """A response to a step may lie in a single block, which one fold holds out."""
+    monkeypatch.setattr(Refits, "evidence", lambda self, one: VERY_STRONG + 0.1)
+    fit: Any = object()
+    one = candidate(effect, gain, 10.0, q=q)
+    one = replace(one, tried=replace(one.tried, fit=fit))
+    assert refits(NOTHING).by_evidence([one], 0.05)[0].helps is helps
+    worse = replace(one, harms=True)
+    assert refits(NOTHING).by_evidence([worse], 0.05) == [worse]
+
+
+@pytest.mark.parametrize(
     ("model", "noise"),
     [(dgp.Compartments(1), False), (dgp.NonlinearFeedback(1), True), (dgp.Wiener(1), True)],
 )

@@ -37,6 +37,16 @@ class Step(Channel):
 
 
 @dataclass(frozen=True)
+class StepInput(Step):
+    """A step that acts through the dynamics, as a leak or a load that begins [time unit]."""
+
+    direct: ClassVar[bool] = False
+
+    def _names(self) -> tuple[str, ...]:
+        return (f"disturbance from {self.at:.9g}",)
+
+
+@dataclass(frozen=True)
 class StepOfGain(Channel):
     """An input from an instant on: a gain that shifts.
 

@@ -17,6 +17,7 @@ from pyro_dynogp.data.channels.clock import (
     ShiftedClock,
     Sinusoid,
     Step,
+    StepInput,
     StepOfGain,
     Trend,
     TrendOfGain,
@@ -28,7 +29,7 @@ from pyro_dynogp.data.record import Record
 KINDS: dict[str, type[Channel]] = {
     kind.__name__: kind
     for kind in (
-        Recorded, Delayed, DeadZone, Play, Transformed, Product, Step, StepOfGain, Trend,
+        Recorded, Delayed, DeadZone, Play, Transformed, Product, Step, StepInput, StepOfGain, Trend,
         TrendOfGain, Ramp, RampOfGain, Sinusoid, Calendar, ShiftedClock,
     )
 }  # fmt: skip
