@@ -122,7 +122,8 @@ def candidates_of(
 
     An effect is a candidate if its own test rejects at the level, or nearly does while that of a
     relative does: one cause makes the tests of a family go off together (a delay looks like
-    dynamics, a dead zone like play), and refits alone tell its members apart. Of several channels
+    dynamics, a dead zone like play), and refits alone tell its members apart. What is `imitated`
+    is a candidate always, beside as many others as may be tried. Of several channels
     that one effect may come from, those that reject are candidates, each with what the others
     have not made of the model already.
     """
@@ -132,7 +133,8 @@ def candidates_of(
     for one in found:
         p = one.evidence.p_value
         relative = one.effect.family in families and p <= settings.relative
-        if (p > level and not relative) or len(out) >= tries:
+        due = (p <= level or relative) and len(out) < tries
+        if not (due or one.effect.imitated):
             continue
         known = made.setdefault(one.effect.name, set())
         extended, _ = extended_by(one, model, record)

@@ -65,7 +65,8 @@ class SharedScaleNormal(TorchDistribution):
         dims, slices = len(self.event_shape), self.event_shape[self.apart]
         df, scale = self.df.unsqueeze(-1), self.scale.unsqueeze(-1)
         d = self.event_shape.numel() // max(slices, 1)
-        squares = value.square().movedim(self.apart - dims, -dims).flatten(1 - dims).sum(-1)
+        squares = value.square().movedim(self.apart - dims, -dims)
+        squares = squares.flatten(1 - dims).sum(-1) if dims > 1 else squares
         constant = (
             torch.lgamma(0.5 * (df + d))
             - torch.lgamma(0.5 * df)

@@ -50,6 +50,8 @@ class Effect:
         special_of: name of an effect of which it is a special case; its own name is given only
             where the residual is certain of it.
         once: whether it is not looked for again in a model that has it.
+        imitated: whether slow poles and process noise imitate it so well that its test hardly ever
+            sees it: it is refitted wherever something is left, or forecasts miss.
         added: whether a block mends it; False for what is only reported.
         localised: whether it happens at one instant, so that refits are scored on blocks of the
             whole record rather than after it.
@@ -71,6 +73,7 @@ class Effect:
     acts_on: ClassVar[ActsOn] = "time"
     special_of: ClassVar[str] = ""
     once: ClassVar[bool] = False
+    imitated: ClassVar[bool] = False
     added: ClassVar[bool] = True
     localised: ClassVar[bool] = False
     compared: ClassVar[Compared] = "training"

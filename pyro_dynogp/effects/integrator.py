@@ -55,6 +55,7 @@ class Integrator(Effect):
     acts_on = "inputs"
     freedom = 2
     once = True
+    imitated = True  # of seven motors their angle's integrator had p-values from 0.08 to 1
     experiments: ClassVar = {
         "unmodelled dynamics": "a step of the input, left alone for several times the slowest time "
         "constant: an integrator continues at the same rate, a slow pole comes to rest",
@@ -66,6 +67,10 @@ class Integrator(Effect):
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
         """A pole at zero in the last dynamic layer; nothing where there is one."""
         return variants_of(with_integrator(model))
+
+    def sentence(self, evidence: Evidence, model: Model) -> str:
+        """Without the size of what the residual shows of it, which poles hide."""
+        return f"{evidence.sentence.partition(', about ')[0].rstrip('.')}."
 
     def parameters(self, fit: Fit, evidence: Evidence, record: Record) -> Parameters:
         """Rate of the output for one unit of each input [output / (input time)].

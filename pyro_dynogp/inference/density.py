@@ -6,6 +6,7 @@ import contextlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import pyro
@@ -28,6 +29,9 @@ WALL = 1e15
 AT_ONCE = 12_000
 # So many times as many of a linear model, whose points need next to no memory.
 LINEAR = 8
+# Beyond this logarithms of scales mean nothing. What is larger at an optimum, as a gain may be, may
+# be so many times as large.
+REACH = 40.0
 
 
 @dataclass(frozen=True)
@@ -161,6 +165,11 @@ class Potential:
         self.width = max(1, AT_ONCE // max(count, 1)) if batches else 1
         if self.linear is not None:
             self.width *= LINEAR
+
+    @cached_property
+    def reach(self) -> Tensor:
+        """Sizes (d,) of coordinates beyond which draws count as having no density."""
+        return REACH * self.pack(self.at).abs().clamp(min=1.0)
 
     @property
     def size(self) -> int:

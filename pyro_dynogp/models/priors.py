@@ -66,6 +66,13 @@ def _normal(scale: float, *shape: int) -> dist.Distribution:
     return dist.Normal(zero, zero + scale).to_event(len(shape))
 
 
+def _gains(scale: float | None, *shape: int, apart: int) -> dist.Distribution:
+    """Of unknown size around a scale, one size for each entry of `apart`; flat without a scale."""
+    if scale is None:
+        return _normal(FLAT, *shape)
+    return SharedScaleNormal(GAIN_FREEDOM, scale, shape, apart=apart)
+
+
 def _complex(x: Tensor) -> Tensor:
     return torch.complex(x[..., 0], x[..., 1])
 
@@ -94,9 +101,9 @@ class ModesPrior:
       matter (one output; one pair, or independent noise; n_l = 1) they are positive.
     - ``output_gain`` (n_y, P, 2)*: direction of c, only for several outputs; normal(0, 1).
     - ``integrator_gain`` (n_y, n_u)*: rate of each output's integrator for each input over the
-      typical rate, normal(0, 1): with one, inputs that change from sample to sample move the level
-      by a standard deviation within the record. Its pole is zero, and its level at the first sample
-      unknown (`past_input_covariance`).
+      typical rate, of unknown size: with one, inputs that change from sample to sample move the
+      level by a standard deviation within the record; without a slow part they need tens. The pole
+      is zero, and the level at the first sample unknown (`past_input_covariance`).
     - ``integrator_drift`` (n_y,)*: the same of what drives it beside the inputs, always (the input
       that keeps the level is not the mean of the record's).
     - ``integrator_noise`` (n_y, n_l)*: the random walk of the level, how far it gets within the
@@ -169,13 +176,7 @@ class ModesPrior:
         flat, wide = self.priors == "paper", self.time_scale.brevity
         sites = [*self._pole_sites(named("pair"))]
         if n_u:
-            gain = (
-                _normal(FLAT, P, n_u, terms)
-                if flat
-                else SharedScaleNormal(
-                    GAIN_FREEDOM, wide * self.gain_scale, (P, n_u, terms), apart=1
-                )
-            )
+            gain = _gains(None if flat else wide * self.gain_scale, P, n_u, terms, apart=1)
             over = named("pair", "input", "term")
             sites.append(Site(f"{name}_input_gain", gain, over, growth=0.0))
             if self.feedthrough and self._prompt:
@@ -200,15 +201,14 @@ class ModesPrior:
             over = named("output", "pair", "part")
             sites.append(Site(f"{name}_output_gain", direction, over))
         if self.levels:
-            wide, count = FLAT if flat else 1.0, self.levels
-            level = dims.get("level", dims.get("output", "output"))
-            prior = _normal(wide, count)
-            sites.append(Site(f"{name}_integrator_drift", prior, (level,)))
+            n, level = self.levels, dims.get("level", dims.get("output", "output"))
+            one = None if flat else 1.0
+            sites.append(Site(f"{name}_integrator_drift", _gains(one, n, apart=0), (level,)))
             if n_u:
-                prior, over = _normal(wide, count, n_u), (level, *named("input"))
+                prior, over = _gains(one, n, n_u, apart=1), (level, *named("input"))
                 sites.append(Site(f"{name}_integrator_gain", prior, over, growth=0.0))
             if self.process_noise:
-                prior, over = _normal(wide, count, self.brownian), (level, *named("brownian"))
+                prior, over = _normal(one or FLAT, n, self.brownian), (level, *named("brownian"))
                 sites.append(Site(f"{name}_integrator_noise", prior, over))
         return tuple(sites)
 

@@ -94,6 +94,23 @@ def test_relatives_of_a_certain_effect_are_tried_up_to_a_p_value():
     assert tried(0.31, "time", LoopSettings(relative=0.4)) == ["first", "other"]
 
 
+def test_what_is_imitated_is_tried_whatever_its_test_says_and_takes_no_place():
+    class Imitated(Certain):
+        imitated = True
+
+    record = machine(seed=1)
+    model = dgp.LinearDynamicGP(1, pairs=1)
+    found = [
+        Found(*speaking(Certain("first", 0.01), 0.01), 0.01),
+        Found(*speaking(Certain("second", 0.02), 0.02), 0.02),
+        Found(*speaking(Imitated("third", 0.9), 0.9), 1.0),
+        Found(*speaking(Certain("fourth", 0.9), 0.9), 1.0),
+    ]
+    chosen = candidates_of(found, model, record, 0.05, 1, SETTINGS)
+    assert [one.effect.name for one, _ in chosen] == ["first", "third"]
+    assert [e.name for e in effects.CATALOGUE if e.imitated] == ["integrator"]
+
+
 @pytest.fixture(scope="module")
 def state():
     """A search on a small record in which nothing lacks."""

@@ -27,6 +27,15 @@ def test_density_is_that_of_a_student_t_for_each_slice(apart):
         torch.testing.assert_close(found[:, b], of_one.log_prob(slices).sum(-1))
 
 
+def test_of_a_vector_every_entry_has_a_size_of_its_own():
+    prior = SharedScaleNormal(3.0, 0.7, (4,), apart=-1)
+    x = torch.randn(5, 4, dtype=torch.float64)
+    exact = scipy.stats.t(3.0, scale=0.7).logpdf(x.numpy()).sum(1)
+    torch.testing.assert_close(prior.log_prob(x), torch.from_numpy(exact))
+    torch.testing.assert_close(prior.log_prob(x[0]), torch.as_tensor(exact[0]))
+    assert prior.sample((6,)).shape == (6, 4)
+
+
 def test_draws_have_the_marginals_and_share_their_size_within_a_slice_only():
     torch.manual_seed(0)
     prior = SharedScaleNormal(5.0, 0.7, (2, 3), apart=1)

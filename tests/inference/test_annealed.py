@@ -268,3 +268,24 @@ def test_what_few_particles_say_of_a_covariance_counts_little():
     even = torch.full((20_000,), 1.0 / 20_000, dtype=torch.float64)
     for root in (root_of(many, even, torch.eye(d).double()), root_of(many, even)):
         np.testing.assert_allclose(root @ root.mT, exact, atol=0.05 * float(exact.abs().max()))
+
+
+def test_a_gain_may_be_as_large_as_at_the_optimum_and_more(record):
+    """Logarithms of scales have a reach of 40; a gain of 100 had none, and no draw a density."""
+    model = dgp.LinearDynamicGP(inputs=1, pairs=1).scaled_to(record)
+    with torch.random.fork_rng(), torch.no_grad(), pyro.poutine.block():
+        torch.manual_seed(0)
+        trace = pyro.poutine.trace(model).get_trace(record)
+    values = {n: s["value"] for n, s in trace.nodes.items() if s["type"] == "sample" and n != "y"}
+
+    def with_gains(size: float) -> dict[str, torch.Tensor]:
+        return values | {"g_input_gain": torch.full((1, 1, 2), size, dtype=torch.float64)}
+
+    for at, most in ((with_gains(0.5), 40.0), (with_gains(100.0), 4000.0)):
+        potential = Potential(model, (record,), at)
+        z, place = potential.pack(at), potential.places(["g_input_gain"])[0]
+        assert float(potential.reach[place]) == most
+        for gain, inside in ((0.99 * most, True), (1.01 * most, False)):
+            moved = z.clone()
+            moved[place] = gain
+            assert np.isfinite(Joint(potential, len(record)).log_prob(moved[None])[0]) == inside

@@ -7,10 +7,12 @@ import pyro
 import pytest
 import torch
 from scipy.linalg import expm
+from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 from statsmodels.tsa.statespace.structural import UnobservedComponents
 
 import pyro_dynogp as dgp
+from pyro_dynogp.inference.starts.poles import values_given_poles
 from pyro_dynogp.layers.sites import sample
 from pyro_dynogp.lti.covariance import autocovariance
 from pyro_dynogp.lti.response import mean_response
@@ -311,3 +313,46 @@ def test_hidden_signals_do_not_see_integrators(process_noise, outputs):
     assert labels["g_integrator_gain"] == ("output", "g_input")
     outputs_ = MomentOutputs(model.begin(model.system(values, along.scaling), {}), along)
     assert np.isfinite(float(outputs_.log_prob(along.observations)))
+
+
+# Of the sensor of a position; its input moves it by four times as much.
+NOISE = 0.005
+
+
+def fast_moves(n=400, seed=3):
+    """A position that integrates an input without a slow part, behind a lag."""
+    rng = np.random.default_rng(seed)
+    u = np.diff(rng.standard_normal(n + 1))
+    lagged = lfilter([0.0, 0.3], [1.0, -0.7], u)
+    y = 0.05 * np.cumsum(np.concatenate([[0.0], lagged[:-1]]))
+    return dgp.Record(0.1 * np.arange(n), u[:, None], (y + NOISE * rng.standard_normal(n))[:, None])
+
+
+def test_rates_may_be_large_and_draws_of_them_forecast():
+    """What the integral of a fast input makes is small: gains are tens of standard deviations.
+
+    A normal prior of one held them down (its cost was hundreds of nats), and draws counted for
+    nothing beyond 40.
+    """
+    record = fast_moves()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        fit = dgp.fit(dgp.LinearDynamicGP(1, pairs=1, integrators=1), record[:250], **QUICK)
+    assert float(fit.draws["g_integrator_gain"].mean()) > 20.0
+    assert np.isfinite(fit.diagnostics["pareto_k"])
+    found = fit.forecast(record[:250], record[250:])
+    assert np.sqrt(np.mean((found.mean - record.outputs[250:]) ** 2)) < 1.2 * NOISE
+
+
+def test_starts_have_the_rate_that_data_say_beside_time():
+    """Time goes far and the integral of a fast input does not: one ridge is for both."""
+    record = fast_moves()
+    model = dgp.LinearDynamicGP(1, pairs=1, integrators=1).scaled_to(record)
+    (along,) = model.prepare(record)
+    poles = np.array([np.log(0.7) / 0.1 + 0.01j])
+    _, values = values_given_poles(model, [along], along.scaling, poles)
+    rate = np.sqrt(np.pi / (39.9 * 0.1))
+    u, y = along.scaling.input_scale[0], along.scaling.output_scale[0]
+    exact = 0.05 / 0.1 / rate * float(u / y)
+    assert exact > 20.0
+    assert float(values["g_integrator_gain"]) == pytest.approx(exact, rel=0.1)

@@ -47,8 +47,6 @@ MOVES = 2
 MOST_TEMPERATURES = 60
 # Samples times particles that are evaluated at once.
 AT_ONCE = 400_000
-# Unconstrained values (logarithms of scales, mostly) beyond which a density counts as zero.
-REACH = 40.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,9 +73,10 @@ class Joint:
 
     def _far(self, z: Tensor) -> Tensor:
         """Where the density counts as zero (S,)."""
-        far = ~(z.abs() <= REACH).all(-1)
+        far = ~(z.abs() <= self.potential.reach).all(-1)
         if self.order is not None:
-            far |= ~torch.from_numpy(self.order.holds(z.numpy()))
+            near = z.masked_fill(far[:, None], 0.0)  # squares of what is beyond may overflow
+            far |= ~torch.from_numpy(self.order.holds(near.numpy()))
         return far
 
     def __call__(self, z: Tensor) -> tuple[Tensor, Tensor]:
@@ -106,7 +105,7 @@ class Prior:
 
     def __call__(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Value (S,), and gradient (S, d)."""
-        far = ~(z.abs() <= REACH).all(-1)
+        far = ~(z.abs() <= self.potential.reach).all(-1)
         energy, slope = each_with_gradient(self._energy, z.masked_fill(far[:, None], 0.0))
         return -energy.masked_fill(far, torch.inf), -slope.masked_fill(far[:, None], 0.0)
 

@@ -106,7 +106,8 @@ def values_given_poles(
         designs.append(np.concatenate([*parts, np.ones((len(u), 1))], axis=1))
         targets.append(record.scaled_outputs.numpy())
     X, Y = np.concatenate(designs), np.concatenate(targets)
-    weights = np.stack([_ridge(X, Y[:, a]) for a in range(n_y)])  # n_y, columns
+    size = _sizes(X, model.direct + 2 * P * n_u, (n_u + 1) * layer.integrators)
+    weights = np.stack([_ridge(X / size, Y[:, a]) for a in range(n_y)]) / size  # n_y, columns
     residual = Y - X @ weights.T
     direct, weights = weights[:, : model.direct], weights[:, model.direct :]
     spread = np.nanstd(residual, axis=0)
@@ -184,6 +185,16 @@ def _levels(grid: TimeGrid, u: np.ndarray) -> np.ndarray:
     """Integrals (n, n_u + 1) of held inputs, and time."""
     held = np.diff(grid.time.numpy())[:, None] * np.insert(u, u.shape[1], 1.0, axis=1)[:-1]
     return np.concatenate([np.zeros((1, held.shape[1])), np.cumsum(held, axis=0)])
+
+
+def _sizes(X: np.ndarray, first: int, count: int) -> np.ndarray:
+    """Root mean squares of so many columns from one on, and one for others (columns,).
+
+    An integral may be far smaller than time, and a ridge that is for both would hold it down.
+    """
+    size = np.ones(X.shape[1])
+    size[first : first + count] = np.sqrt(np.mean(X[:, first : first + count] ** 2, axis=0))
+    return size
 
 
 def _ridge(X: np.ndarray, y: np.ndarray, strength: float = 1e-4) -> np.ndarray:
