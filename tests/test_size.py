@@ -50,7 +50,7 @@ LINES = 31_500
 # a time limit within a trial (220 lines), and steps that act through dynamics, and rates of
 # integrators of unknown size (130 lines).
 # To shrink.
-LINES_TODAY = 56_470
+LINES_TODAY = 56_480
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

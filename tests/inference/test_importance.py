@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import cloudpickle
 import numpy as np
@@ -18,8 +19,10 @@ from pyro_dynogp.inference import importance_sampling
 from pyro_dynogp.inference.cascade_coordinates import StraightPotential
 from pyro_dynogp.inference.density import Potential
 from pyro_dynogp.inference.importance_sampling import pooled, proposal_of, sample_around, weighed
+from pyro_dynogp.inference.methods import importance
 from pyro_dynogp.inference.methods.annealed import Annealed
 from pyro_dynogp.inference.pareto import effective, good_k, psis
+from pyro_dynogp.inference.run import Run
 
 QUICK = {"restarts": 2, "workers": 1, "progress": False}
 MODEL = dgp.LinearDynamicGP(1, pairs=1, process_noise=False)
@@ -281,6 +284,30 @@ def test_options():
     with pytest.raises(ValueError, match="draws: expected a whole number >= 1"):
         dgp.Importance(draws=0)
     assert dataclasses.astuple(dgp.Importance()) == (300, None, None)
+
+
+@pytest.mark.parametrize(
+    ("model", "longest"),
+    [
+        (dgp.LinearDynamicGP(1), 5000),
+        (dgp.Cascade(1, (dgp.Dynamic(),), dgp.StudentT()), 1000),
+        (dgp.Wiener(1), 1000),
+        (dgp.NonlinearFeedback(1), 150),
+    ],
+)
+def test_how_long_a_record_may_be_for_annealing(model, longest, monkeypatch):
+    assert importance.usual_longest(model) == longest
+    if model.has_gaussian_process:
+        return
+    asked = []
+    monkeypatch.setattr(
+        importance, "sample_around", lambda *args, longest, **options: asked.append(longest) or 1
+    )
+    run, problem = Run(0), SimpleNamespace(model=model, target=model, records=())
+    for given in (None, 70):
+        with pytest.raises(AttributeError):  # what comes after needs draws
+            importance.with_draws_around(problem, [], run, 10, given)
+    assert asked == [longest, 70]
 
 
 def test_where_annealing_gets_nowhere(fit, monkeypatch):
