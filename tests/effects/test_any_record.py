@@ -115,7 +115,7 @@ def test_units_and_order_do_not_matter_of_time(detector):
     assert other.p_value == pytest.approx(one.p_value, rel=1e-6)
     assert other.size == pytest.approx(1e-3 * one.size, rel=1e-6)
     for key, value in one.where.items():
-        if key in ("time", "shift", "period", "time_scale"):
+        if key in ("time", "begin", "shift", "period", "time_scale"):
             assert other.where[key] == pytest.approx(60.0 * value, rel=1e-6)
         elif key == "size":
             assert other.where[key] == pytest.approx(1e-3 * value, rel=1e-6)
