@@ -12,7 +12,7 @@ from pyro_dynogp.effects.base import Effect, changed, number_of
 from pyro_dynogp.models.variants import Model, with_channel
 from pyro_dynogp.models.wiring import StaticLayer
 from pyro_dynogp.statistics.evidence import Evidence, Residuals
-from pyro_dynogp.statistics.pictures import evidence, instant, over_time
+from pyro_dynogp.statistics.pictures import evidence, instant, over_time, unit
 from pyro_dynogp.statistics.prewhitening import Projection, spanning
 from pyro_dynogp.statistics.settings import LoopSettings
 from pyro_dynogp.statistics.steps import beginning, instants, step_scan
@@ -46,7 +46,7 @@ def level_shift(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) 
         "level shift",
         scan,
         {"time": float(r.time[at]), "size": size, "begin": float(r.time[begin])},
-        f"The level of {r.output_name!r} steps {way} by {abs(size):.3g} {r.output_unit} "
+        f"The level of {r.output_name!r} steps {way} by {abs(size):.3g}{unit(r.output_unit)} "
         f"at {instant(r, at)}.",
         over_time(r, scan.fitted),
     )
@@ -104,8 +104,13 @@ class LevelShift(Effect):
         return [changed(model, [last], at=time) for time in inside]
 
     def sentence(self, evidence: Evidence, model: Model) -> str:
-        """What it is where the step acts through the dynamics."""
+        """What it is where the step acts through the dynamics; how far is for its gain to say."""
         if not isinstance(model.channels[-1], StepInput):
             return evidence.sentence
-        moves = evidence.sentence.replace(" steps ", " moves ", 1)
-        return f"{moves} It follows a step of a disturbance through the dynamics."
+        start, _, rest = evidence.sentence.rpartition(" by ")
+        level, _, way = start.rpartition(" steps ")
+        when = rest.partition(" at ")[2].rstrip(".")
+        return (
+            f"{level} moves {way} about {when}, as the dynamics respond to an earlier step of a "
+            "disturbance."
+        )

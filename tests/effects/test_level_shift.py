@@ -90,7 +90,17 @@ class TestBlock:
         assert channel.at == pytest.approx(145.0, abs=0.5 if direct else 1.5)
         assert report.after["rmse"] < 1.1 * 0.05
         (effect,) = report.effects
-        assert ("through the dynamics" in effect.sentence) is not direct
+        if direct:
+            assert effect.sentence == "The level of 'y' steps down by 1 at time 145 s."
+        else:
+            assert effect.sentence == (
+                "The level of 'y' moves down about time 152 s, as the dynamics respond to an "
+                "earlier step of a disturbance."
+            )
+            ((label, (gain, sd)), _) = effect.parameters.items()
+            assert label.startswith("steady-state gain of disturbance from 14")
+            assert abs(gain + 1.0) < 4.0 * sd  # a leak of one, of a lag whose gain is one
+            assert 0.0 < sd < 0.05
 
     def test_behind_a_function_of_the_inputs_the_level_jumps(self):
         record = leaking(4, False)
