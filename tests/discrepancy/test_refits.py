@@ -28,6 +28,7 @@ from pyro_dynogp.models.delays import longest_delay, unknown_beginning
 from pyro_dynogp.models.variants import (
     with_channel,
     with_output_function,
+    with_pairs,
     without_process_noise,
 )
 from tests.discrepancy.made import SETTINGS, coloured, fitted_mode
@@ -336,6 +337,37 @@ def test_functions_are_fitted_from_the_base_once_a_variant_is_chosen(monkeypatch
         variants = tuple(with_channel(model, Delayed("u", k * STEP)) for k in (4, 5))
         run(Trial(variants, record, (fold,), start, 0, SETTINGS, "forecast"))
         assert (calls[-1] is start) == model.has_function
+
+
+@pytest.mark.parametrize("compared", ["training", "known"])
+def test_variants_of_an_instant_are_compared_on_all_known_data(record, base, monkeypatch, compared):
+    """The instant may be held out; what is kept is fitted to the training data all the same."""
+    fold, seen, refined, fitted = np.arange(len(record)) >= 200, [], [], []
+
+    def raced(fit, models, data, run):
+        seen.append(int(np.isfinite(data.outputs[:, 0]).sum()))
+        return race(fit, models, data, run)
+
+    def noted(fit, data, *, model=None, run=None):
+        fitted.append(int(np.isfinite(data.outputs[:, 0]).sum()))
+        return refit(fit, data, model=model, run=run)
+
+    def finer(model, data, times):
+        refined.append(int(np.isfinite(data.outputs[:, 0]).sum()))
+        return []
+
+    monkeypatch.setattr(leading_variant, "race", raced)
+    monkeypatch.setattr(trials, "refit", noted)
+    plain = replace(base.model, scaling=None)
+    trial = Trial(
+        (plain, with_pairs(plain, 1)), record, (fold,), base, 0, SETTINGS, "forecast",
+        refine=finer, compared=compared,
+    )  # fmt: skip
+    assert not run(trial).failure
+    own = len(record) if compared == "known" else 200
+    assert set(seen) == {own}
+    assert set(refined) == {own}
+    assert fitted == [200]
 
 
 def test_what_has_no_finer_variants_races_once(monkeypatch, record, base):

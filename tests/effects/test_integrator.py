@@ -11,6 +11,7 @@ from pyro_dynogp.effects.drift import drift
 from pyro_dynogp.effects.hysteresis import hysteresis
 from pyro_dynogp.effects.input_nonlinearity import input_nonlinearity
 from pyro_dynogp.effects.integrator import Integrator, integrator
+from pyro_dynogp.statistics.evidence import Evidence
 from tests.discrepancy.made import SETTINGS, coloured, lag, residuals_of
 
 STEP, RATE = 0.1, 0.25
@@ -101,6 +102,11 @@ def test_the_loop_names_an_integrator_and_its_rate(tank):
     assert 0.0 < sd < 2e-5
     assert report.after["rmse"] < 0.024  # noise 0.02
     assert report.after["rmse"] < report.before["rmse"]
+
+
+def test_what_the_residual_shows_of_it_is_not_its_size():
+    found = Evidence("integrator", 1.0, 0.5, 1.0, 1.0, {}, "'y' integrates channel 'u', about 2 m.")
+    assert EFFECT.sentence(found, dgp.LinearDynamicGP(1)) == "'y' integrates channel 'u'."
 
 
 def test_no_rate_without_units():
