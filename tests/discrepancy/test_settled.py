@@ -342,13 +342,15 @@ def test_parametric_functions_in_feedback_are_settled_by_evidence_where_they_gai
         (effects.LevelShift(), 0.1, 1e-4, True),
         (effects.LevelShift(), -0.1, 1e-4, False),  # held-out data speak against it
         (effects.LevelShift(), 0.1, 0.0101, False),  # the residual has its doubts
+        (effects.ProcessNoise(), 0.1, 1e-4, True),
+        (effects.HeavyTails(), 0.1, 1e-4, False),
         (effects.GainShift(), 0.1, 1e-4, False),
     ],
 )
-def test_what_one_block_may_hide_is_settled_by_evidence_where_it_gains(
+def test_what_one_block_or_a_mode_may_hide_is_settled_by_evidence_where_it_gains(
     monkeypatch: pytest.MonkeyPatch, effect: effects.Effect, gain: float, q: float, helps: bool
 ) -> None:
-    """A response to a step may lie in a single block, which one fold holds out."""
+    """A response to a step may lie in a block that one fold holds out; modes may be poor."""
     monkeypatch.setattr(Refits, "evidence", lambda self, one: VERY_STRONG + 0.1)
     fit: Any = object()
     one = candidate(effect, gain, 10.0, q=q)
