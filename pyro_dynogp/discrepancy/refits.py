@@ -315,7 +315,7 @@ class Refits:
         effect = one.found.effect
         if one.harms or one.tried.fit is None or one.found.q_value > level:
             return False
-        brief = self._adds_forms(one) or effect.compared == "known" or effect.absorbs_structure
+        exempt = self._adds_forms(one) or effect.compared == "known" or effect.absorbs_structure
         gains = exempt and not self.weighed and one.attempt.gain > 0.0
         return one.attempt.decision == "nearly" or gains
 
