@@ -289,7 +289,7 @@ def test_options():
 @pytest.mark.parametrize(
     ("model", "longest"),
     [
-        (dgp.LinearDynamicGP(1), 5000),
+        (dgp.LinearDynamicGP(1), 2000),
         (dgp.Cascade(1, (dgp.Dynamic(),), dgp.StudentT()), 1000),
         (dgp.Wiener(1), 1000),
         (dgp.NonlinearFeedback(1), 150),

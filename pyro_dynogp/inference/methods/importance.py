@@ -22,9 +22,9 @@ from pyro_dynogp.support.frozen import FrozenMapping
 
 # Samples of a record beyond which draws are not annealed by default, of linear models with
 # Gaussian noise, of others, and with feedback: normals around kernels by the evidence do as well
-# there, in a third of the time. Of a linear model with two pairs along 1400 samples annealing takes
-# 0.3 s of 1.7, along 5000 samples half of 3.2 s; with five pairs along 20 000 samples 35 s of 58.
-LONGEST_LINEAR, LONGEST, LONGEST_FEEDBACK = 5000, 1000, 150
+# there, in a third of the time. Of a linear model annealing takes a quarter of the climb along 1400
+# samples (two pairs), 20 to 40 % along 2000 (five pairs), 40 to 90 % along 4000.
+LONGEST_LINEAR, LONGEST, LONGEST_FEEDBACK = 2000, 1000, 150
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Importance:
 
     Attributes:
         draws: posterior draws to keep, of equal weight.
-        longest: most samples along which draws are annealed; None for 5000 of a linear model with
+        longest: most samples along which draws are annealed; None for 2000 of a linear model with
             Gaussian noise, 1000 of others, 150 with feedback.
         optimizer: for the climbs, as of `Mode`.
 
