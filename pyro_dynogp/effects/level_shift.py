@@ -38,9 +38,10 @@ def level_shift(residuals: Residuals, settings: LoopSettings, *, seed: int = 0) 
     nuisance = spanning(np.column_stack([r.mean, r.inputs]))
     scan, _, at = step_scan(r, np.ones((len(r), 1)), nuisance, settings, seed)
     size = float(scan.fitted[at] - scan.fitted[at - 1])
-    under = Projection(scan.whitener, nuisance, ~np.isfinite(r.residual), settings)
-    noticed = scan.p_value < settings.noticed and len(r.poles) > 0
-    begin = _onset(r, under, at, settings) if noticed else at
+    begin = at
+    if scan.p_value < settings.noticed and len(r.poles) > 0:
+        under = Projection(scan.whitener, nuisance, ~np.isfinite(r.residual), settings)
+        begin = _onset(r, under, at, settings)
     way = "up" if size > 0 else "down"
     return evidence(
         "level shift",

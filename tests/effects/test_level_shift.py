@@ -87,6 +87,7 @@ class TestBlock:
         assert [one.name for one in report.effects] == ["level shift"]
         (channel,) = report.fit.model.channels
         assert type(channel) is (Step if direct else StepInput)
+        # A sample is 0.5: a jump is seen within one, a response of 20 samples within three.
         assert channel.at == pytest.approx(145.0, abs=0.5 if direct else 1.5)
         assert report.after["rmse"] < 1.1 * 0.05
         (effect,) = report.effects

@@ -167,12 +167,17 @@ def test_posterior_of_a_conjugate_model():
     assert found.log_evidence == pytest.approx(float(exact), abs=0.15)
 
 
-def test_one_bad_particle_does_not_spoil_the_others(record):
-    model = dgp.LinearDynamicGP(inputs=1, pairs=1).scaled_to(record)
+def drawn(model, record):
+    """Values of all sites, drawn from the prior."""
     with torch.random.fork_rng(), torch.no_grad(), pyro.poutine.block():
         torch.manual_seed(0)
         trace = pyro.poutine.trace(model).get_trace(record)
-    values = {n: s["value"] for n, s in trace.nodes.items() if s["type"] == "sample" and n != "y"}
+    return {n: s["value"] for n, s in trace.nodes.items() if s["type"] == "sample" and n != "y"}
+
+
+def test_one_bad_particle_does_not_spoil_the_others(record):
+    model = dgp.LinearDynamicGP(inputs=1, pairs=1).scaled_to(record)
+    values = drawn(model, record)
     potential = Potential(model, (record,), values)
     joint = Joint(potential, len(record))
     z = potential.pack(values)
@@ -273,10 +278,7 @@ def test_what_few_particles_say_of_a_covariance_counts_little():
 def test_a_gain_may_be_as_large_as_at_the_optimum_and_more(record):
     """Logarithms of scales have a reach of 40; a gain of 100 had none, and no draw a density."""
     model = dgp.LinearDynamicGP(inputs=1, pairs=1).scaled_to(record)
-    with torch.random.fork_rng(), torch.no_grad(), pyro.poutine.block():
-        torch.manual_seed(0)
-        trace = pyro.poutine.trace(model).get_trace(record)
-    values = {n: s["value"] for n, s in trace.nodes.items() if s["type"] == "sample" and n != "y"}
+    values = drawn(model, record)
 
     def with_gains(size: float) -> dict[str, torch.Tensor]:
         return values | {"g_input_gain": torch.full((1, 1, 2), size, dtype=torch.float64)}

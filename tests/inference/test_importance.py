@@ -299,15 +299,18 @@ def test_how_long_a_record_may_be_for_annealing(model, longest, monkeypatch):
     assert importance.usual_longest(model) == longest
     if model.has_gaussian_process:
         return
-    asked = []
-    monkeypatch.setattr(
-        importance, "sample_around", lambda *args, longest, **options: asked.append(longest) or 1
-    )
-    run, problem = Run(0), SimpleNamespace(model=model, target=model, records=())
-    for given in (None, 70):
-        with pytest.raises(AttributeError):  # what comes after needs draws
-            importance.with_draws_around(problem, [], run, 10, given)
-    assert asked == [longest, 70]
+
+    class AskedError(Exception):
+        """Raised in place of sampling."""
+
+    def asked(*args, longest, **options):
+        raise AskedError(longest)
+
+    monkeypatch.setattr(importance, "sample_around", asked)
+    problem = SimpleNamespace(model=model, target=model, records=())
+    for given, most in ((None, longest), (70, 70)):
+        with pytest.raises(AskedError, match=f"^{most}$"):
+            importance.with_draws_around(problem, [], Run(0), 10, given)
 
 
 def test_where_annealing_gets_nowhere(fit, monkeypatch):

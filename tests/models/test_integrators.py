@@ -335,9 +335,7 @@ def test_rates_may_be_large_and_draws_of_them_forecast():
     nothing beyond 40.
     """
     record = fast_moves()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        fit = dgp.fit(dgp.LinearDynamicGP(1, pairs=1, integrators=1), record[:250], **QUICK)
+    fit = dgp.fit(dgp.LinearDynamicGP(1, pairs=1, integrators=1), record[:250], **QUICK)
     assert float(fit.draws["g_integrator_gain"].mean()) > 20.0
     assert np.isfinite(fit.diagnostics["pareto_k"])
     found = fit.forecast(record[:250], record[250:])
@@ -355,4 +353,6 @@ def test_starts_have_the_rate_that_data_say_beside_time():
     u, y = along.scaling.input_scale[0], along.scaling.output_scale[0]
     exact = 0.05 / 0.1 / rate * float(u / y)
     assert exact > 20.0
+    # The noise of a quarter of the output makes the least squares uncertain by some percent; a
+    # ridge that time dominates leaves a twentieth (2.1 of 36).
     assert float(values["g_integrator_gain"]) == pytest.approx(exact, rel=0.1)
