@@ -68,8 +68,10 @@ def periodic_disturbance(
     bins = np.arange(int(np.ceil(settings.cycles * length / span)), length // 2)
     deviations = np.zeros((len(r.deviations), span))
     deviations[:, at[kept] - looked[0]] = r.deviations[:, kept]
-    scan = prewhitened(x, lines(bins, length, settings), nuisance, deviations, settings, seed=seed)
-    under = Projection(scan.whitener, nuisance, ~np.isfinite(x), settings)
+    missing = ~np.isfinite(x)
+    variants = lines(bins, length, nuisance, missing, settings)
+    scan = prewhitened(x, variants, nuisance, deviations, settings, seed=seed)
+    under = Projection(scan.whitener, nuisance, missing, settings)
     frequency = refined(under, x, bins[scan.best] / length, 1.0 / length)
     period = r.step / frequency
     effect, also = harmonics(under, x, frequency, settings.harmonic)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cache
+
 import numpy as np
 from scipy.fft import fft, rfft
 from scipy.optimize import minimize_scalar
@@ -37,49 +40,87 @@ def slots(r: Residuals) -> np.ndarray:
     return at
 
 
-def lines(bins: np.ndarray, length: int, settings: LoopSettings) -> Variants:
+@dataclass(frozen=True, eq=False)
+class _Beside:
+    """What stands beside a line under filters of one order, the same for every series.
+
+    Attributes:
+        rows: (m,) samples that have all of their past. Q: (m, M) orthonormal basis of the nuisance.
+        products: (3, J) of cosine and cosine, sine and sine, cosine and sine at each frequency,
+            less what the nuisance explains of them.
+    """
+
+    rows: np.ndarray
+    Q: np.ndarray
+    products: np.ndarray
+
+
+def lines(
+    bins: np.ndarray,
+    length: int,
+    nuisance: np.ndarray,
+    missing: np.ndarray,
+    settings: LoopSettings,
+) -> Variants:
     """Sines at frequencies bins / length [1 / step]: all by one Fourier transform.
 
     A filter makes of a sine a sine of the same frequency, so both span the same, and the
     residual's own past stands beside it as more columns of nuisance.
-    """
 
-    def prepare(under: Projection) -> Score:
-        p, n, nuisance = under.whiten.order, len(under.missing), under.nuisance
-        rows = np.flatnonzero(under.rows) + p
-        beside = spanning(nuisance[rows])
+    Args:
+        bins: (J,). nuisance: (n, M) from `spanning`. missing: (n,). settings: thresholds.
+    """
+    n = len(missing)
+
+    def parts(rows: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Sums of columns (m, K) times cosines and times sines, each (K, J)."""
+        full = np.zeros((values.shape[1], n))
+        full[:, rows] = values.T
+        F = rfft(full, length, axis=1)[:, bins]
+        return F.real, -F.imag
+
+    def products(C: np.ndarray, S: np.ndarray) -> np.ndarray:
+        """Of cosines and sines, as far as orthonormal columns with these sums explain them."""
+        return np.array([np.square(C).sum(0), np.square(S).sum(0), (C * S).sum(0)])
+
+    @cache
+    def beside_order(p: int) -> _Beside:
+        whole = np.isfinite(Whitener(np.zeros(p))(np.where(missing, np.nan, 0.0)))
+        rows = np.flatnonzero(whole) + p
         mask = np.zeros(n)
         mask[rows] = 1.0
         double = fft(mask, length)[(2 * bins) % length]
+        every = 0.5 * np.array([len(rows) + double.real, len(rows) - double.real, -double.imag])
+        Q = np.linalg.qr(spanning(nuisance[rows]))[0]
+        return _Beside(rows, Q, every - products(*parts(rows, Q)))
 
-        def parts(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            full = np.zeros((values.shape[1], n))
-            full[:, rows] = values.T
-            F = rfft(full, length, axis=1)[:, bins]
-            return F.real, -F.imag
+    def prepare(under: Projection) -> Score:
+        p = under.whiten.order
+        beside = beside_order(p)
+        rows, Q = beside.rows, beside.Q
 
         def score(x: np.ndarray) -> Scored:
-            past = [x[rows - k] for k in range(1, p + 1)]
-            Q = np.linalg.qr(np.column_stack([beside, *past]))[0]
-            e = x[rows] - Q @ (Q.T @ x[rows])
-            C, S = parts(np.column_stack([e, Q]))
-            c, s, C, S = C[0], S[0], C[1:], S[1:]
-            cc = 0.5 * (len(rows) + double.real) - np.square(C).sum(0)
-            ss = 0.5 * (len(rows) - double.real) - np.square(S).sum(0)
-            cs = -0.5 * double.imag - (C * S).sum(0)
+            past = np.column_stack([x[rows], *(x[rows - k] for k in range(1, p + 1))])
+            left = past - Q @ (Q.T @ past)
+            e, P = left[:, 0], np.linalg.qr(left[:, 1:])[0]
+            e = e - P @ (P.T @ e)
+            C, S = parts(rows, np.column_stack([e, P]))
+            c, s = C[0], S[0]
+            cc, ss, cs = beside.products - products(C[1:], S[1:])
             determinant = cc * ss - cs**2
             usable = determinant > 1e-6 * len(rows) ** 2
             explained = (ss * c**2 - 2.0 * cs * c * s + cc * s**2) / np.where(
                 usable, determinant, 1.0
             )
-            samples = len(e) - Q.shape[1]
+            samples = len(e) - Q.shape[1] - p
             gains = samples * log_ratio(np.where(usable, explained, 0.0), float(e @ e))
 
             def fit(j: int) -> tuple[np.ndarray, np.ndarray]:
-                line = _wave(n, bins[j] / length)
-                design = np.column_stack([*past, line[rows], nuisance[rows]])
-                noise = Whitener(np.linalg.lstsq(design, x[rows], rcond=1e-9)[0][:p])
-                beside_line = Projection(noise, nuisance, under.missing, settings)
+                line, beside_line = _wave(n, bins[j] / length), under
+                if p:
+                    design = np.column_stack([past[:, 1:], line[rows], nuisance[rows]])
+                    noise = Whitener(np.linalg.lstsq(design, past[:, 0], rcond=1e-9)[0][:p])
+                    beside_line = Projection(noise, nuisance, missing, settings)
                 return beside_line.with_nuisance(beside_line.fit(line, x), x)
 
             return gains, fit
