@@ -308,14 +308,12 @@ class Refits:
     def _may_be_weighed(self, one: Judged, level: float) -> bool:
         """Whether a candidate nearly helps, or gains where no more can be expected.
 
-        The latter where tests are certain: of parametric functions in feedback, of whose few
-        numbers short blocks tell too little; of a response that may lie in one block, held out; and
-        of process noise, whose mode may have a poor mean (37 +- 37 nats, draws of it 120).
+        The latter where tests are certain: of effects that are `settled_by_evidence`, and of
+        parametric functions in feedback, of whose few numbers short blocks tell too little.
         """
-        effect = one.found.effect
         if one.harms or one.tried.fit is None or one.found.q_value > level:
             return False
-        exempt = self._adds_forms(one) or effect.compared == "known" or effect.absorbs_structure
+        exempt = self._adds_forms(one) or one.found.effect.settled_by_evidence
         gains = exempt and not self.weighed and one.attempt.gain > 0.0
         return one.attempt.decision == "nearly" or gains
 

@@ -61,6 +61,9 @@ class Effect:
             in how they extrapolate: held out, of those whose forecasts last.
         absorbs_structure: whether its block takes up whatever else a model lacks, so that a search
             begins without it.
+        settled_by_evidence: whether the density of one block may be far too uncertain to confirm
+            it, however right it is: where tests are certain and it gains at all, the evidence of
+            all known data decides.
         experiments: by name of another effect, the experiment that tells the two apart. One of
             the two effects need say so.
         test: finds evidence in residuals; a class whose test needs more overrides `detect`.
@@ -78,6 +81,7 @@ class Effect:
     localised: ClassVar[bool] = False
     compared: ClassVar[Compared] = "training"
     absorbs_structure: ClassVar[bool] = False
+    settled_by_evidence: ClassVar[bool] = False
     experiments: ClassVar[Mapping[str, str]] = {}
     test: ClassVar[Callable[..., Evidence | Sequence[Evidence]]]
 

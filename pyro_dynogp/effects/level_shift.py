@@ -79,6 +79,7 @@ class LevelShift(Effect):
     family = "time"
     localised = True
     compared = "known"
+    settled_by_evidence = True  # the response may lie in one block, held out
     test = staticmethod(level_shift)
 
     def extend(self, model: Model, evidence: Evidence, record: Record) -> Sequence[Model]:
