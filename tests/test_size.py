@@ -48,9 +48,10 @@ LINES = 31_500
 # of parameters beside coloured errors (70 lines), and climbs and variants side by side, and starts,
 # densities and verbs of models with dead times (310 lines), and outputs of functions in lanes and
 # a time limit within a trial (220 lines), and steps that act through dynamics, and rates of
-# integrators of unknown size (130 lines).
+# integrators of unknown size (130 lines), and what stands beside lines in a spectrum, which is kept
+# for all replicates (50 lines).
 # To shrink.
-LINES_TODAY = 56_480
+LINES_TODAY = 56_540
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

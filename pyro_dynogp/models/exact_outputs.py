@@ -277,15 +277,19 @@ class ExactOutputs(OutputProcess):
             assert constant is not None
             sd = self.columns(constant)
         noise = sd.square().numpy()
-        fresh = LTIProcess(process.modes, process.grid, process.inputs, nothing_left(process.modes))
-        unit = 1.0 if self._physical else self.scale.square()
-        driven = np.minimum((unit * self.columns(fresh.variance)).numpy(), variance).mean(0)
-        parts = {
-            "parameters": mean.var(0),
-            "initial state": variance.mean(0) - driven,
-            "process noise": driven,
-            "measurement noise": np.broadcast_to(noise.mean(0), mean.shape[1:]),
-        }
+
+        def parts() -> dict[str, np.ndarray]:
+            known = nothing_left(process.modes)
+            fresh = LTIProcess(process.modes, process.grid, process.inputs, known)
+            unit = 1.0 if self._physical else self.scale.square()
+            with torch.no_grad():
+                driven = np.minimum((unit * self.columns(fresh.variance)).numpy(), variance).mean(0)
+            return {
+                "parameters": mean.var(0),
+                "initial state": variance.mean(0) - driven,
+                "process noise": driven,
+                "measurement noise": np.broadcast_to(noise.mean(0), mean.shape[1:]),
+            }
 
         def draw() -> np.ndarray:
             with torch.no_grad(), seeded(seed):
@@ -293,7 +297,7 @@ class ExactOutputs(OutputProcess):
                 drawn = self._from_process(Moments(y, torch.zeros(()), torch.zeros(()))).mean
                 return spread_evenly(drawn.numpy(), samples)
 
-        return Components(mean, variance, noise, lambda: parts, draw)
+        return Components(mean, variance, noise, parts, draw)
 
     def sample(self, sample_shape: Any = ()) -> Tensor:
         """Draw outputs."""
