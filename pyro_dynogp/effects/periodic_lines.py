@@ -91,7 +91,7 @@ def lines(
         mask[rows] = 1.0
         double = fft(mask, length)[(2 * bins) % length]
         every = 0.5 * np.array([len(rows) + double.real, len(rows) - double.real, -double.imag])
-        Q = np.linalg.qr(spanning(nuisance[rows]))[0]
+        Q = spanning(nuisance[rows])
         return _Beside(rows, Q, every - products(*parts(rows, Q)))
 
     def prepare(under: Projection) -> Score:

@@ -26,6 +26,8 @@ from pyro_dynogp.statistics.settings import LoopSettings
 
 # Numbers of filtered columns that are multiplied at once.
 AT_ONCE = 1_000_000
+# Share of a column's size that may be rounding of its mean.
+ROUNDING = 1e-12
 
 
 class Projection:
@@ -181,7 +183,9 @@ def spanning(columns: np.ndarray) -> np.ndarray:
     constant = np.full((n, 1), 1.0 / np.sqrt(n))
     x = np.nan_to_num(columns - np.nanmean(columns, axis=0)) if columns.size else np.zeros((n, 0))
     size = np.sqrt(np.square(x).sum(0))
-    x = x[:, size > 0] / size[size > 0]
+    # A constant column less its mean is zero, or rounding: a constant once more.
+    varies = size > ROUNDING * np.sqrt(np.nansum(np.square(columns), axis=0))
+    x = x[:, varies] / size[varies]
     if not x.shape[1]:
         return constant
     left, values, _ = np.linalg.svd(x, full_matrices=False)
