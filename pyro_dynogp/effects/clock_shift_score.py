@@ -83,7 +83,7 @@ def score_of_shifts(tried: Shifts) -> Variants:
     """
 
     def prepare(under: Projection) -> Score:
-        rows = np.flatnonzero(under.rows) + under.whiten.order
+        rows = under.samples
         w = under.filtered(tried.changes)
         starts = np.searchsorted(rows, tried.edges)
         masks = tried.parts[:, rows]

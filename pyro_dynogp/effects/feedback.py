@@ -86,7 +86,7 @@ def _followed(
     missing = ~(np.isfinite(x) & np.isfinite(future).all(1))
     under = Projection(whiten, spanning(input_columns(r)), missing, settings)
     white, e = under.filtered(x), under(x)
-    F = future[whiten.order :][under.rows]
+    F = future[under.samples]
     size = np.sqrt(np.square(F).sum(0))
     F = F / np.where(size > 0, size, 1.0)
     F = F - under.Q @ (under.Q.T @ F)

@@ -85,8 +85,7 @@ def lines(
 
     @cache
     def beside_order(p: int) -> _Beside:
-        whole = np.isfinite(Whitener(np.zeros(p))(np.where(missing, np.nan, 0.0)))
-        rows = np.flatnonzero(whole) + p
+        rows = Projection(Whitener(np.zeros(p)), nuisance, missing, settings).samples
         mask = np.zeros(n)
         mask[rows] = 1.0
         double = fft(mask, length)[(2 * bins) % length]
@@ -117,7 +116,7 @@ def lines(
 
             def fit(j: int) -> tuple[np.ndarray, np.ndarray]:
                 line, beside_line = _wave(n, bins[j] / length), under
-                if p:
+                if p:  # else there is no colour beside the line either
                     design = np.column_stack([past[:, 1:], line[rows], nuisance[rows]])
                     noise = Whitener(np.linalg.lstsq(design, past[:, 0], rcond=1e-9)[0][:p])
                     beside_line = Projection(noise, nuisance, missing, settings)

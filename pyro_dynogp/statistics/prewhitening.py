@@ -51,6 +51,11 @@ class Projection:
         self.rows = np.isfinite(whiten(np.where(missing, np.nan, 0.0)))
         check_samples(int(self.rows.sum()), settings, "samples beside gaps")
 
+    @property
+    def samples(self) -> np.ndarray:
+        """(m,) places of these rows among all samples."""
+        return np.flatnonzero(self.rows) + self.whiten.order
+
     @cached_property
     def _decomposed(self) -> tuple[np.ndarray, np.ndarray]:
         """What the filter makes of the nuisance, as Q R."""

@@ -132,7 +132,7 @@ def steps(signals: np.ndarray, places: np.ndarray) -> Variants:
         def pulses(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
             """Sum over k of weights_k values_(s+k) for s in 0..n-1; values (m, ...) on rows."""
             full = np.zeros((n + p, *values.shape[1:]))
-            full[p:n][under.rows] = values
+            full[under.samples] = values
             return np.sum([w * full[k : n + k] for k, w in enumerate(weights) if w], axis=0)
 
         def from_there(values: np.ndarray) -> np.ndarray:

@@ -31,6 +31,11 @@ def left(columns: np.ndarray, x: np.ndarray) -> float:
     return float(rest @ rest)
 
 
+def with_past(missing: np.ndarray, order: int) -> np.ndarray:
+    """Samples that are there with all of their past."""
+    return np.array([t for t in range(order, N) if not missing[t - order : t + 1].any()])
+
+
 def sine(frequency: float) -> np.ndarray:
     angle = 2.0 * np.pi * frequency * np.arange(N)
     return np.column_stack([np.cos(angle), np.sin(angle)])
@@ -48,11 +53,9 @@ def test_gains_are_those_of_least_squares_beside_the_past(gaps: bool, order: int
         under = Projection(Whitener(np.full(p, 0.1)), nuisance, missing, SETTINGS)
         gains, _ = variants.prepare(under)(x)
         assert np.array_equal(kinds.setdefault(p, gains), gains)
-    rows = [t for t in range(order, N) if not missing[t - order : t + 1].any()]
-    past = np.column_stack(
-        [np.ones(len(rows)), *(x[np.array(rows) - k] for k in range(1, order + 1))]
-    )
-    beside = np.column_stack([nuisance[rows], past])
+    rows = with_past(missing, order)
+    past = [x[rows - k] for k in range(1, order + 1)]
+    beside = np.column_stack([nuisance[rows], np.ones(len(rows)), *past])
     degrees = len(rows) - nuisance.shape[1] - order
     for place in (0, 48, 200, len(BINS) - 30):
         line = sine(BINS[place] / LENGTH)[rows]
@@ -73,7 +76,7 @@ def test_what_a_line_explains_is_what_least_squares_give_it(gaps: bool, order: i
     waves = [sine(h * BINS[place] / LENGTH) for h in (1, 2, 3, 4)]
     wave = np.column_stack([*waves, *(shift * one for one in waves)])
     both = np.column_stack([wave, nuisance])
-    rows = np.array([t for t in range(order, N) if not missing[t - order : t + 1].any()])
+    rows = with_past(missing, order)
     past = [x[rows - k] for k in range(1, order + 1)]
     colour = np.linalg.lstsq(np.column_stack([*past, both[rows]]), x[rows])[0][:order]
 
