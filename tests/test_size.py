@@ -49,9 +49,9 @@ LINES = 31_500
 # densities and verbs of models with dead times (310 lines), and outputs of functions in lanes and
 # a time limit within a trial (220 lines), and steps that act through dynamics, and rates of
 # integrators of unknown size (130 lines), and what stands beside lines in a spectrum, which is kept
-# for all replicates (50 lines).
+# for all replicates (50 lines), and units that models with feedback keep (50 lines).
 # To shrink.
-LINES_TODAY = 56_540
+LINES_TODAY = 56_590
 
 # What is larger today; what has shrunk has to leave the list.
 LARGE_FILES: set[str] = set()

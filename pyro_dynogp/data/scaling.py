@@ -128,6 +128,21 @@ class Scaling:
             **{field: getattr(first, field) for field in _NAMES},
         )
 
+    def with_scales_of(self, other: Scaling) -> Scaling:
+        """Clock and scales of another scaling, and these for channels that it does not have."""
+        changes: dict[str, Any] = {"time_step": other.time_step, "duration": other.duration}
+        for role in ("input", "output"):
+            names, known = (getattr(one, f"{role}_names") for one in (self, other))
+            for field in (f"{role}_offset", f"{role}_scale"):
+                theirs = dict(zip(known, getattr(other, field), strict=True))
+                own = zip(names, getattr(self, field), strict=True)
+                changes[field] = np.array([theirs.get(name, x) for name, x in own])
+            if names == known:
+                changes[f"{role}_order"] = getattr(other, f"{role}_order")
+        if self.output_names == other.output_names:
+            changes["reference_output"] = other.reference_output
+        return dataclasses.replace(self, **changes)
+
     def check(self, record: Record, *, outputs: bool = True) -> None:
         """Refuse a record whose channels or units are not those of the training data.
 

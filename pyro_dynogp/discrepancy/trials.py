@@ -146,7 +146,9 @@ def run(trial: Trial, ahead: Ahead = ALONE) -> Tried:
             found = first
             if index > 0:
                 rest = without(trial.record, fold)
-                found = refit(trial.base, rest, model=first.model, run=trial.run)
+                # With functions every start of an effect would climb again for each of the folds.
+                start = first if first.model.has_function else trial.base
+                found = refit(start, rest, model=first.model, run=trial.run)
             density, error = scored(found, trial.record, fold, trial.score)
             parts.append(density)
             beside.append(error)

@@ -78,8 +78,9 @@ def refit(
     """Fit again by the same method, beginning at what a fit has learnt.
 
     The same model keeps its scaling, and with it every prior: what changes is the data alone. A
-    model that extends it gets the units of the new records, and starts where nothing that is new
-    does anything yet. `fit.at_mode()` gives a mode again, whatever the method was.
+    model that extends it gets the units of the new records, or with feedback keeps those of the
+    fit, and starts where nothing that is new does anything yet. `fit.at_mode()` gives a mode again,
+    whatever the method was.
 
     Args:
         fit: the old fit.
@@ -96,7 +97,7 @@ def refit(
     several = (records,) if isinstance(records, Record) else tuple(records)
     fit.check_collapsed()
     if model is not None:
-        problem = Problem.of(model, several)
+        problem = Problem.extending(fit, model, several)
         return _posterior(fit, problem, _extended(fit, problem, run), run)
     if len(several) != len(fit.records):
         raise invalid("records", expected=f"{len(fit.records)}, as before", got=str(len(several)))

@@ -46,17 +46,19 @@ def innovate_together(problem: FilterProblem) -> tuple[np.ndarray, np.ndarray, n
     N, E = parts["m0"].shape[-1], int(layout.f_start[-1])
     gaussian, curved = len(layout.share) == 1, layout.measured >= 0
     kept = 3 if curved else 2 if gaussian else 4
+    groups = -(-count // WIDTH)
+    lanes, used = _in_groups(parts, groups), _in_use(parts)
+    each_found = np.full((groups, kept, *y.shape, WIDTH), np.nan)
 
-    def group(g: int) -> np.ndarray:
-        rows = np.minimum(np.arange(g * WIDTH, (g + 1) * WIDTH), count - 1)
+    def group(g: int) -> None:
         own = room(N, E, channels, widest, layout.nodes.shape[1])
-        found = np.full((kept, *y.shape, WIDTH), np.nan)
-        there = min(count - g * WIDTH, WIDTH)
         work = Bench(*bench(len(layout.share)))
-        innovate_lanes(layout, *_lanes(parts, rows, y), own, work, there, found)
-        return np.moveaxis(found, -1, 0)[:there]
+        values = Values(**{name: x[g] for name, x in lanes.items()}, y=y)
+        there = min(count - g * WIDTH, WIDTH)
+        innovate_lanes(layout, values, used, own, work, there, each_found[g])
 
-    found = np.concatenate(each(group, -(-count // WIDTH)))
+    each(group, groups)
+    found = np.moveaxis(each_found, -1, 1).reshape(groups * WIDTH, kept, *y.shape)[:count]
     error, variance = found[:, 0], found[:, 1]
     # Where there is no density, or runs have grown without bound.
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -70,15 +72,21 @@ def innovate_together(problem: FilterProblem) -> tuple[np.ndarray, np.ndarray, n
     return error.reshape(shape), variance.reshape(shape), density.reshape(shape)
 
 
-def _lanes(parts: dict[str, np.ndarray], rows: np.ndarray, y: np.ndarray) -> tuple[Values, InUse]:
-    """Points of one group; those that fill it are its last one again."""
-    group = {name: x[rows] for name, x in parts.items()}
-    lanes = {
-        name: x if name in _TABLES else np.ascontiguousarray(np.moveaxis(x, 0, -1))
-        for name, x in group.items()
-    }
-    used = InUse(
-        (group["table_variance"] != 0.0).any((0, 2)),
-        *((group[name] != 0.0).any(0) for name in ("G", "H", "gamma")),
+def _in_groups(parts: dict[str, np.ndarray], groups: int) -> dict[str, np.ndarray]:
+    """Arrays of lanes (groups, ..., WIDTH); what fills the last group is the last point again."""
+    count = len(parts["m0"])
+    rows = np.minimum(np.arange(groups * WIDTH), count - 1)
+    found = {}
+    for name, x in parts.items():
+        several = (x if len(rows) == count else x[rows]).reshape(groups, WIDTH, *x.shape[1:])
+        lanes = several if name in _TABLES else np.moveaxis(several, 1, -1)
+        found[name] = np.ascontiguousarray(lanes)
+    return found
+
+
+def _in_use(parts: dict[str, np.ndarray]) -> InUse:
+    """What is not zero at every point."""
+    return InUse(
+        (parts["table_variance"] != 0.0).any((0, 2)),
+        *((parts[name] != 0.0).any(0) for name in ("G", "H", "gamma")),
     )
-    return Values(**lanes, y=y), used

@@ -12,7 +12,7 @@ from pyro_dynogp.support.compiled import WITHIN
 
 
 class InUse(NamedTuple):
-    """What is not zero at every point of a group: the rest is passed over.
+    """What is not zero at every point: the rest is passed over.
 
     Attributes:
         variance: (E,) of functions. G: (D, A), H: (n_y, A), gamma: (k, N, E), as of `Values`.

@@ -112,6 +112,24 @@ def test_constant_within_each_record_is_no_constant():
     assert Scaling.from_records(records).input_scale.tolist() == [0.5, 0.5]
 
 
+def test_scales_of_another_for_the_channels_that_it_has():
+    short, long = (Scaling.from_records(example(n, seed=n)) for n in (5, 9))
+    assert long.with_scales_of(short) == short
+    wider = Scaling.from_records(
+        example(9, seed=9, inputs=np.arange(27.0).reshape(9, 3) ** 2, input_names=["a", "w", "b"],
+                input_units=["V", "", "A"])
+    )  # fmt: skip
+    found = wider.with_scales_of(short)
+    assert (found.time_step, found.duration) == (short.time_step, short.duration)
+    for field in ("offset", "scale"):
+        (a, b), (_, w, _) = (getattr(s, f"input_{field}") for s in (short, wider))
+        assert getattr(found, f"input_{field}").tolist() == [a, w, b]
+        outputs = (getattr(s, f"output_{field}").tolist() for s in (found, short))
+        assert next(outputs) == next(outputs)
+    assert found.input_names == ("a", "w", "b")
+    assert found.input_order == wider.input_order
+
+
 def test_nothing_to_learn_from():
     with refused("output 'y'", "missing samples alone"):
         Scaling.from_records(example(outputs=np.full(5, np.nan)))

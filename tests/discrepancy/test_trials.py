@@ -324,6 +324,28 @@ def test_later_variants_are_fitted_one_by_one_while_something_is_left(
     assert [one.model for one in made] == list(models[:fitted])
 
 
+@pytest.mark.parametrize(
+    ("model", "kept"), [(dgp.Wiener(1), True), (dgp.LinearDynamicGP(1), False)]
+)
+def test_with_functions_later_folds_begin_where_the_first_one_ended(
+    record, monkeypatch, model, kept
+):
+    base, first = (SimpleNamespace(model=replace(model, scaling=None)) for _ in range(2))
+    begun = []
+
+    def again(start, *_, **__):
+        begun.append(start)
+        return first
+
+    monkeypatch.setattr(trials, "_kept", lambda *_: first)
+    monkeypatch.setattr(trials, "refit", again)
+    monkeypatch.setattr(trials, "scored", lambda *_: (np.zeros(2), np.zeros((2, 1))))
+    folds = tuple(np.arange(N) // 80 == k for k in range(3))
+    tried = trials.run(trials.Trial((model,), record, folds, base, 0, SETTINGS))
+    assert [one is first for one in begun] == [kept, kept]
+    assert len(tried.densities) == 6
+
+
 @pytest.mark.parametrize("workers", [1, 2, 3, 40])
 @pytest.mark.parametrize(("noise", "kept"), [(20.0, "step_of_hidden"), (None, "hysteresis")])
 def test_variants_that_are_fitted_side_by_side_come_to_the_same(

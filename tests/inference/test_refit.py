@@ -8,9 +8,10 @@ import pytest
 import torch
 
 import pyro_dynogp as dgp
-from pyro_dynogp.data.channels import Delayed
+from pyro_dynogp.data.channels import Delayed, Recorded
 from pyro_dynogp.inference import refit as refits
 from pyro_dynogp.inference.function_evidence import kernel_sites
+from pyro_dynogp.inference.optimise.optimum import Optimum
 from pyro_dynogp.inference.posteriors import Mixture
 from pyro_dynogp.inference.refit import optima_of, refit
 from pyro_dynogp.inference.run import Run
@@ -157,6 +158,38 @@ def test_what_is_new_in_feedback_is_looked_for_along_an_excerpt_of_long_records(
     climbs.clear()
     refit(again, record, model=again.model)  # nothing is new
     assert climbs == [(80, 1)]
+
+
+@pytest.mark.parametrize("more", [False, True])
+def test_with_feedback_what_is_learnt_keeps_its_units_next_to_other_data(monkeypatch, more):
+    """In units of other data a cubic spring is another one, and climbs begin far from the fit."""
+    record = make_record(n=80, missing=False)
+    louder = record.outputs * np.where(np.arange(80) < 50, 1.0, 1.6)[:, None] + 0.3
+    record = replace(record.with_outputs(louder), extra={"w": np.sin(np.arange(80.0))})
+    part, model = record[:50], with_feedback(dgp.LinearDynamicGP(1, pairs=1))
+    base = dgp.fit(dgp.LinearDynamicGP(1, pairs=1), part, method="map", restarts=1, workers=1,
+                   progress=False)  # fmt: skip
+    fit = refit(base, part, model=model, run=Run(0, workers=1, steps=2))
+    larger = with_channel(replace(fit.model, scaling=None), Recorded("w")) if more else fit.model
+    begun = []
+
+    def watched(target, records, starts, *rest, **_):
+        begun.append(starts[0])
+        return [Optimum(0.0, start, np.zeros(1), "") for start in starts]
+
+    monkeypatch.setattr(refits, "maximise", watched)
+    again = refit(fit, record, model=larger, run=Run(0, workers=1, steps=1))
+    system, learnt = (one.model.system(at, one.scaling) for one, at in
+                      ((again, begun[0]), (fit, fit.mode)))  # fmt: skip
+    torch.testing.assert_close(*(one.dynamic[0][1].modes.poles for one in (system, learnt)))
+    found = again.scaling
+    assert found.output_scale == fit.scaling.output_scale
+    assert found.output_offset == fit.scaling.output_offset
+    assert found.duration == fit.scaling.duration
+    assert found.input_scale[0] == fit.scaling.input_scale[0]
+    assert len(found.input_scale) == 1 + more
+    linear = refit(base, record, model=replace(base.model, scaling=None))
+    assert linear.scaling.output_scale != base.scaling.output_scale
 
 
 @pytest.mark.parametrize(

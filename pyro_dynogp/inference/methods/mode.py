@@ -277,22 +277,24 @@ def climb(
     """
 
     def optima_of(
-        target: Model, points: Sequence[Values], key: str, known: int = 0
+        target: Model, points: Sequence[Values], key: str, effort: Effort
     ) -> list[Optimum]:
         return maximise(target, records, points, run, optimizer=optimizer, steps=steps, key=key,
-                        effort=effort, learnt=known)  # fmt: skip
+                        effort=effort, learnt=len(learnt))  # fmt: skip
 
     quiet = without_noise_below_functions(model)
     better: list[Optimum] = []
     if quiet != model and starts:
         steps = max(1, steps // 2)
         key = f"{prefix}without-process-noise"
-        found = optima_of(quiet, [*learnt, *(louder(start) for start in starts)], key, len(learnt))
+        found = optima_of(quiet, [*learnt, *(louder(start) for start in starts)], key, effort)
         better = found[: (len(starts) + 1) // 2]
         starts = [grown(one.values, faint(starts[0])) for one in better]
+        # They have climbed: their order says more than that of what has not.
+        effort = replace(effort, kept=min(effort.kept, HALF.kept))
     elif model.has_feedback:
         starts = [louder(start) for start in starts]
-    optima = optima_of(model, [*learnt, *starts], f"{prefix}cascade", len(learnt))
+    optima = optima_of(model, [*learnt, *starts], f"{prefix}cascade", effort)
     if not better or not (model.has_feedback or math.isfinite(line)):
         return optima
     prepared = model.prepare(records)
