@@ -51,8 +51,9 @@ class Problem:
     ) -> Problem:
         """Records checked and prepared, the model in their units; `start` is a fit to start from.
 
-        With `units` the model is in these. Of a model with dead times outputs are missing until
-        inputs have arrived, or, where dead times are free, are likely to.
+        With `units` the model is in these, of all channels that they have. Of a model with dead
+        times outputs are missing until inputs have arrived, or, where dead times are free, are
+        likely to.
 
         Raises:
             ValueError: as of `Model.check`; on constant or entirely missing signals.
@@ -63,25 +64,14 @@ class Problem:
         if longest < FEWEST:
             expected = f"a record of {FEWEST} samples or more to fit to"
             raise invalid("record", expected=expected, got=f"{longest} samples")
-        scaling = units or Scaling.from_records(checked)
+        scaling = Scaling.from_records(checked)
+        if units is not None:
+            scaling = scaling.with_scales_of(units)
         prepared = tuple(PreparedRecord.of(record, scaling) for record in checked)
         if model.late:
             prepared = without_unknown(model, prepared)
         learnt = None if start is None else dict(start.mode)
         return cls(replace(model, scaling=scaling), prepared, learnt)
-
-    @classmethod
-    def extending(cls, fit: Fitted, model: Model, records: Sequence[Record]) -> Problem:
-        """What a model that extends that of a fit is fitted to, with feedback in its units.
-
-        In others what is learnt is another system, whose free runs may be far off: 10 % more of an
-        output's scale make a cubic spring a fifth softer. Of a pendulum with a step more the climb
-        began 850 000 nats below what was learnt, and ended 23 nats below the optimum found here.
-        """
-        problem = cls.of(model, records)
-        if not model.has_feedback:
-            return problem
-        return cls.of(model, records, units=problem.scaling.with_scales_of(fit.scaling))
 
     @property
     def target(self) -> Model:
